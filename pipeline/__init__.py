@@ -1,0 +1,1 @@
+"""The library: data, model, training and evaluation of place recognition on the global batch."""

@@ -1,0 +1,307 @@
+"""Every setting of a run, as typed frozen dataclasses: the one source of the YAML keys, the command line and `--help`.
+
+Invariant: nothing here imports torch, so `--help` is instant; a field's docstring says what it means, its unit and,
+where the paper (Lu et al., CricaVPR, CVPR 2024) fixes it, the paper's value. Defaults are the published settings
+except where the docstring says "ours".
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from shards.errors import UsageError
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """What is trained on, in which order, and how images are prepared."""
+
+    shards: str = "data/shards"
+    """Folder, or any fsspec URL, of a shard set made by jobs.prepare."""
+    places_per_batch: int = 72
+    """Places in the global batch, over all ranks; four images each (paper: 72, so 288 images)."""
+    order: Literal["city", "mixed", "blocked"] = "city"
+    """Order of places: in-city batches (as published in effect), mixed over cities, or within windows of shards."""
+    window_shards: int = 8
+    """Shards read together by order=blocked."""
+    image_size: int = 224
+    """Side of the square input, in pixels; a multiple of the patch size (paper: 224)."""
+    augment: Literal["rand", "light", "off"] = "rand"
+    """RandAugment as published; a light colour jitter and crop; or nothing."""
+    rand_ops: int = 3
+    """RandAugment: operations an image (paper: 3)."""
+    rand_magnitude: int = 9
+    """RandAugment: magnitude out of 30 (published: 9)."""
+    workers: int = 4
+    """Decoding processes a rank; 0 decodes in the training process."""
+    prefetch: int = 2
+    """Batches each worker prepares ahead."""
+    cache: str = "data/cache"
+    """Local folder for shards fetched from a URL."""
+    cache_gb: float = 50.0
+    """Bound of that cache in GB (10^9 bytes)."""
+
+
+@dataclass(frozen=True)
+class BackboneConfig:
+    """The image encoder. `name` fills the sizes; `custom` takes them from the fields below."""
+
+    name: Literal["dinov2_vits14", "dinov2_vitb14", "dinov2_vitl14", "dinov2_vitg14", "custom"] = "dinov2_vitb14"
+    """DINOv2 variant (paper: ViT-B/14 without registers), or custom."""
+    weights: str | None = None
+    """A released DINOv2 .pth, a safetensors file, a transformers folder or hub name; none: random weights."""
+    dim: int = 768
+    """custom: channels D of a token."""
+    depth: int = 12
+    """custom: transformer blocks."""
+    heads: int = 12
+    """custom: attention heads of a block."""
+    patch: int = 14
+    """custom: patch side in pixels."""
+    mlp_ratio: int = 4
+    """custom: hidden width of the MLP over dim."""
+    layerscale: float = 1.0
+    """custom: initial LayerScale; 1.0 suits training from scratch, 1e-5 is DINOv2's own start."""
+    pretrain_grid: int = 37
+    """custom: side of the stored position embedding's grid; it is resized once to the input's grid (DINOv2: 37)."""
+    attention: Literal["sdpa", "eager", "flash_attention_2", "flex_attention"] = "sdpa"
+    """Attention implementation of transformers."""
+
+
+@dataclass(frozen=True)
+class AdapterConfig:
+    """The adapter beside the MLP of every block (paper, section 3.3)."""
+
+    kind: Literal["mulconv", "vanilla", "conv", "conv1x1", "conv3x3", "conv5x5", "none"] = "mulconv"
+    """mulconv (paper); vanilla bottleneck; conv: 3x3 without skip (Convpass-like); single kernels with skip; none."""
+    ratio: float = 0.5
+    """Bottleneck width over dim (paper: 0.5, so 384)."""
+    reduced: int = 24
+    """Channels after the 1x1 reduction of the 3x3 and 5x5 paths (paper: 24)."""
+    scale: float = 0.2
+    """The factor s of Eq. 4 (paper: 0.2)."""
+    norm: Literal["batch", "group", "none"] = "batch"
+    """Normalisation in the convolution paths: global BatchNorm (published), GroupNorm (per image), or none."""
+    init: Literal["kaiming", "published"] = "kaiming"
+    """Convolution initialisation: Kaiming (ours), or the published constant 1e-5, which keeps reductions one channel
+    wide for ever."""
+
+
+@dataclass(frozen=True)
+class PoolingConfig:
+    """Patch tokens to regional features (paper, section 3.2)."""
+
+    kind: Literal["spm", "spmg", "gem", "cls"] = "spm"
+    """spm: pyramid whose first level is the class token (paper); spmg: GeM on all levels; gem: one GeM; cls: class token."""
+    levels: tuple[int, ...] = (1, 2, 3)
+    """Pyramid levels n, each of n x n cells (paper: 1, 2, 3, so 14 regions)."""
+    p: float = 3.0
+    """Initial exponent of GeM, learnable and shared (published: 3)."""
+
+
+@dataclass(frozen=True)
+class CrossImageConfig:
+    """The cross-image encoder: attention over the images of the batch, region by region (paper, Eq. 3)."""
+
+    layers: int = 2
+    """Transformer encoder layers; 0 leaves the encoder out (paper: 2)."""
+    heads: int = 16
+    """Attention heads (published: 16)."""
+    feedforward: int = 2048
+    """Width of the feed-forward part (published: 2048)."""
+    dropout: float = 0.1
+    """Dropout in attention, feed-forward and residuals (published: 0.1)."""
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The assembled model."""
+
+    backbone: BackboneConfig = field(default_factory=BackboneConfig)
+    """The image encoder."""
+    adapter: AdapterConfig = field(default_factory=AdapterConfig)
+    """The adapters in its blocks."""
+    pooling: PoolingConfig = field(default_factory=PoolingConfig)
+    """Regional features."""
+    cross_image: CrossImageConfig = field(default_factory=CrossImageConfig)
+    """The cross-image encoder."""
+    train: Literal["adapters", "full", "frozen", "last"] = "adapters"
+    """What of the backbone is trained: its adapters (paper), all of it, nothing, or the last blocks."""
+    last_blocks: int = 4
+    """train=last: how many blocks at the end are trained."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Multi-similarity loss with online mining (paper, Eq. 5)."""
+
+    alpha: float = 1.0
+    """Weight of positives (paper: 1)."""
+    beta: float = 50.0
+    """Weight of negatives (paper: 50)."""
+    base: float = 0.0
+    """The similarity threshold lambda (paper: 0)."""
+    margin: float = 0.1
+    """Mining margin (paper: 0.1)."""
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """Which sets are searched, under which protocols. A recall means nothing without these."""
+
+    sets: tuple[str, ...] = ()
+    """Folders of evaluation sets, `<dataset>/images/<split>/{database,queries}`, or a set's name under `root`."""
+    root: str = "data"
+    """Folder under which set names are looked up."""
+    split: Literal["train", "val", "test"] = "test"
+    """Split of the folder layout."""
+    groups: tuple[Literal["single", "shuffled", "ordered"], ...] = ("single", "shuffled", "ordered")
+    """Which images share an inference batch: each alone, seeded random groups, or neighbours in file order (the
+    paper's way)."""
+    group_size: int = 16
+    """Images a group for shuffled and ordered (paper: 16; 8 on Pittsburgh)."""
+    group_seed: int = 0
+    """Seed of the shuffled grouping."""
+    recalls: tuple[int, ...] = (1, 5, 10, 20)
+    """The N of Recall@N."""
+    radius: float = 25.0
+    """Metres within which a database image is a positive, inclusive (paper: 25)."""
+    frames: int | None = None
+    """For sequences without positions: positives are +- this many frames instead of metres."""
+    without_positives: Literal["miss", "drop"] = "miss"
+    """Queries that have no positive count as a miss, or are dropped (MSLS's own tool)."""
+    resize: Literal["antialias", "published"] = "antialias"
+    """antialias: resize as in training, then normalise; published: normalise, then resize bilinear without antialias."""
+    pca: int | None = None
+    """Dimensions kept by PCA; none keeps all (paper: 4096)."""
+    batch: int = 32
+    """Images a forward pass of the per-image part; memory only, never the result."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Optimisation, checkpoints and stopping."""
+
+    epochs: int = 10
+    """Epochs over the plan (paper: 10)."""
+    steps: int | None = None
+    """Stop after this many steps, whatever the epochs; none: no limit."""
+    optimizer: Literal["adam", "adamw", "sgd"] = "adam"
+    """Optimiser (paper: Adam)."""
+    lr: float = 1e-4
+    """Learning rate (paper: 1e-4)."""
+    weight_decay: float = 0.0
+    """Weight decay (published: 0)."""
+    schedule: Literal["step", "cosine", "constant"] = "step"
+    """step halves the rate every `step_epochs` (paper); cosine decays to 0; both stepped per iteration."""
+    step_epochs: float = 3.0
+    """schedule=step: epochs between two reductions (paper: 3)."""
+    step_factor: float = 0.5
+    """schedule=step: factor of a reduction (paper: 0.5)."""
+    warmup_steps: int = 0
+    """Linear warm-up in steps (published: 0)."""
+    clip: float | None = None
+    """Largest norm of the gradient; none: no clipping (published: none)."""
+    patience: int = 3
+    """Stop after this many epochs without a better validation R@5 (paper: 3); 0 never stops early."""
+    encode_chunk: int | None = None
+    """Images encoded at a time on a rank, recomputed in backward; none: all at once. Needs adapter.norm other than
+    batch, since BatchNorm would see chunks."""
+    compile: bool = False
+    """torch.compile the backbone."""
+    engine: Literal["auto", "ddp", "fsdp2"] = "auto"
+    """auto: what accelerate was launched with (DDP, DeepSpeed); fsdp2 shards parameters with fully_shard."""
+    save_every: int = 200
+    """Steps between two saves of the last checkpoint; also at each epoch's end and on SIGTERM or SIGUSR1."""
+    keep: int = 2
+    """Step checkpoints kept beside the best one."""
+    resume: str = "auto"
+    """auto continues the run folder's last checkpoint where there is one; never starts anew (and refuses to
+    overwrite); or the path of a checkpoint."""
+    log_every: int = 10
+    """Steps between two progress lines and metric records."""
+    log_samples: bool = False
+    """Write the sample keys of each step to samples.rank<r>.jsonl, the proof that nothing is repeated or skipped."""
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """MLflow."""
+
+    uri: str | None = None
+    """Tracking server or store; none: MLFLOW_TRACKING_URI, else sqlite in `<output>/mlflow.db`."""
+    experiment: str = "place-recognition"
+    """Experiment name."""
+    enabled: bool = True
+    """False records nothing."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """A training run."""
+
+    name: str = "cricavpr"
+    """Name of the run and of its folder under `output`."""
+    output: str = "outputs"
+    """Folder of all runs."""
+    seed: int = 0
+    """Seed of initialisation, plan, augmentation and dropout."""
+    data: DataConfig = field(default_factory=DataConfig)
+    """Training data."""
+    model: ModelConfig = field(default_factory=ModelConfig)
+    """Model."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """Loss."""
+    train: TrainConfig = field(default_factory=TrainConfig)
+    """Training."""
+    validate: EvaluationConfig = field(default_factory=lambda: EvaluationConfig(split="val", groups=("shuffled",)))
+    """Evaluated after each epoch, best checkpoint chosen by R@5 of the first set and grouping; empty `sets`: none."""
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    """Where runs are recorded."""
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """The config as plain YAML-able values: nested dicts, tuples as lists."""
+    plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
+    return plain
+
+
+def flatten(config: Any) -> dict[str, Any]:
+    """The config as one level with dotted keys, `data.places_per_batch`, as logged to MLflow."""
+    flat: dict[str, Any] = {}
+
+    def walk(prefix: str, value: Any) -> None:
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                walk(f"{prefix}.{key}" if prefix else key, inner)
+        else:
+            flat[prefix] = value
+
+    walk("", to_dict(config))
+    return flat
+
+
+def digest(config: Any) -> str:
+    """Sixteen hex digits that identify a config's values."""
+    return hashlib.sha256(json.dumps(to_dict(config), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def from_dict(kind: type, values: dict[str, Any], where: str = "") -> Any:
+    """Builds dataclass `kind` from plain values (a checkpoint's config.json). Unknown keys raise `UsageError`."""
+    import typing
+
+    hints = typing.get_type_hints(kind)
+    unknown = set(values) - set(hints)
+    if unknown:
+        raise UsageError(f"unknown setting '{where}{sorted(unknown)[0]}'; known here: {', '.join(hints)}")
+    built: dict[str, Any] = {}
+    for key, value in values.items():
+        if dataclasses.is_dataclass(hints[key]) and isinstance(value, dict):
+            built[key] = from_dict(typing.cast(type, hints[key]), value, f"{where}{key}.")
+        else:
+            built[key] = tuple(value) if isinstance(value, list) else value
+    return kind(**built)

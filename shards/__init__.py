@@ -1,0 +1,1 @@
+"""Photos on disk -> WebDataset tar shards and their Parquet index. Imports no torch."""
