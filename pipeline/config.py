@@ -96,7 +96,7 @@ class PoolingConfig:
     """Patch tokens to regional features (paper, section 3.2)."""
 
     kind: Literal["spm", "spmg", "gem", "cls"] = "spm"
-    """spm: pyramid whose first level is the class token (paper); spmg: GeM on all levels; gem: one GeM; cls: class token."""
+    """spm: pyramid, class token as its first level (paper); spmg: GeM on all levels; gem: one GeM; cls: class token."""
     levels: tuple[int, ...] = (1, 2, 3)
     """Pyramid levels n, each of n x n cells (paper: 1, 2, 3, so 14 regions)."""
     p: float = 3.0
@@ -175,7 +175,7 @@ class EvaluationConfig:
     without_positives: Literal["miss", "drop"] = "miss"
     """Queries that have no positive count as a miss, or are dropped (MSLS's own tool)."""
     resize: Literal["antialias", "published"] = "antialias"
-    """antialias: resize as in training, then normalise; published: normalise, then resize bilinear without antialias."""
+    """antialias: resize as in training, then normalise; published: normalise, then resize without antialias."""
     pca: int | None = None
     """Dimensions kept by PCA; none keeps all (paper: 4096)."""
     batch: int = 32

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from types import TracebackType
 from typing import TypeVar
 
@@ -65,7 +65,7 @@ class Progress:
         seconds = max(time.monotonic() - self._start, 1e-9)
         of = f"/{self.total:,}" if self.total is not None else ""
         print(
-            f"{self.label}: {self.done:,}{of} {self.unit}, {self.done / seconds:,.0f} a second{'  ' + note if note else ''}",
+            f"{self.label}: {self.done:,}{of} {self.unit}, {self.done / seconds:,.0f} a second  {note}".rstrip(),
             file=sys.stderr,
             flush=True,
         )
@@ -73,7 +73,7 @@ class Progress:
 
 def track(items: Iterable[Item], label: str, total: int | None = None, unit: str = "it") -> Iterator[Item]:
     """Yields `items` and shows how far it has come."""
-    if total is None and hasattr(items, "__len__"):
+    if total is None and isinstance(items, Sized):
         total = len(items)
     with Progress(label, total, unit) as progress:
         for item in items:
