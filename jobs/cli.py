@@ -27,7 +27,7 @@ def parse(kind: type[Config], description: str, argv: Sequence[str] | None = Non
     Args:
         kind: the dataclass; nested dataclasses become dotted options.
         description: first lines of `--help`.
-        argv: arguments, `sys.argv[1:]` by default.
+        argv: arguments, `sys.argv[1:]` by default. Dashes in option names are underscores; a bool field is a switch.
         config_file: whether `--config FILE` (YAML) is accepted; later options override it.
 
     Raises:
@@ -46,7 +46,7 @@ def parse(kind: type[Config], description: str, argv: Sequence[str] | None = Non
         parser.add_argument("--config", action="config", help="YAML file; options after it override its values")
     parser.add_class_arguments(kind, as_group=True)
     known = [o[2:] for action in parser._actions for o in action.option_strings if o.startswith("--")]
-    values = parser.parse_args(list(argv) if argv is not None else None)
+    values = parser.parse_args(_normalise(sys.argv[1:] if argv is None else argv, parser))
     built = parser.instantiate(values)
     return kind(**{key: value for key, value in vars(built).items() if key != "config"})
 
@@ -71,6 +71,27 @@ def run_job(main: Callable[[], Any]) -> NoReturn:
 def _program() -> str:
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
     return spec.name if spec is not None else sys.argv[0]
+
+
+def _normalise(argv: Sequence[str], parser: Any) -> list[str]:
+    """`--max-bad` for `--max_bad`, and a switch without a value, `--dry-run`, for `--dry_run true`."""
+    switches = {
+        option
+        for action in parser._actions
+        for option in action.option_strings
+        if getattr(action, "_typehint", None) is bool
+    }
+    words: list[str] = []
+    for i, word in enumerate(argv):
+        if word.startswith("--"):
+            name, equals, value = word.partition("=")
+            name = "--" + name[2:].replace("-", "_")
+            words.append(name + equals + value)
+            if name in switches and not equals and (i + 1 == len(argv) or argv[i + 1].startswith("-")):
+                words.append("true")
+        else:
+            words.append(word)
+    return words
 
 
 def _readable(message: str, known: list[str]) -> str:
