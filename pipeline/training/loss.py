@@ -49,7 +49,7 @@ class MultiSimilarityLoss(nn.Module):
     def __init__(self, alpha: float = 1.0, beta: float = 50.0, base: float = 0.0, margin: float = 0.1) -> None:
         super().__init__()
         self.alpha, self.beta, self.base, self.margin = alpha, beta, base, margin
-        self._counts: Tensor | None = None
+        self._summary: tuple[int, Tensor] | None = None
 
     def forward(self, descriptors: Tensor, labels: Tensor) -> Tensor:
         """Loss of the global batch.
@@ -76,27 +76,20 @@ class MultiSimilarityLoss(nn.Module):
             similarity = own @ gather(own).T  # [b, B]
         everyone = gather(labels)
         same = labels[:, None] == everyone[None, :]
-        itself = torch.zeros_like(same)
-        itself[torch.arange(b), rank() * b + torch.arange(b)] = True
+        columns = torch.arange(len(everyone), device=labels.device)
+        itself = columns == rank() * b + columns[:b, None]
         positive, negative = self.mine(similarity.detach(), same & ~itself, ~same)
 
         push = self._soft_sum(-self.alpha * (similarity - self.base), positive) / self.alpha
         pull = self._soft_sum(self.beta * (similarity - self.base), negative) / self.beta
         local = (push + pull).mean()
 
-        counts = torch.stack(
-            [
-                (positive.any(1) | negative.any(1)).sum(),
-                positive.sum(),
-                negative.sum(),
-                torch.tensor(b, device=labels.device),
-            ]
-        ).to(similarity.dtype)
+        counts = torch.stack([(positive.any(1) | negative.any(1)).sum(), positive.sum(), negative.sum()])
         # one small all-reduce carries the loss's global value and the mining counts
-        summary = torch.cat([local.detach()[None], counts])
+        summary = torch.cat([local.detach()[None], counts.to(local.dtype)])
         if is_distributed():
             dist.all_reduce(summary)
-        self._counts = summary[1:]
+        self._summary = (len(everyone), summary[1:])
         return local + (summary[0] / world_size() - local.detach())
 
     def mine(self, similarity: Tensor, positive: Tensor, negative: Tensor) -> tuple[Tensor, Tensor]:
@@ -114,9 +107,10 @@ class MultiSimilarityLoss(nn.Module):
         Raises:
             RuntimeError: before any forward.
         """
-        if self._counts is None:
+        if self._summary is None:
             raise RuntimeError("no batch has been through the loss yet")
-        anchors, positives, negatives, total = self._counts.tolist()
+        total, counts = self._summary
+        anchors, positives, negatives = counts.tolist()
         return MiningStatistics(anchors / total, positives / total, negatives / total)
 
     @staticmethod
