@@ -180,6 +180,18 @@ class EvaluationConfig:
     """Dimensions kept by PCA; none keeps all (paper: 4096)."""
     batch: int = 32
     """Images a forward pass of the per-image part; memory only, never the result."""
+    workers: int = 4
+    """Decoding processes a rank; 0 decodes in the evaluating process."""
+    precision: Literal["fp32", "bf16", "fp16"] = "fp32"
+    """Autocast of the per-image part; the cross-image encoder and the search stay in fp32."""
+    store: Literal["none", "fp32", "fp16"] = "none"
+    """Keep descriptors as Parquet under the output folder, in this type; they are reused when nothing changed."""
+    pca_from: str | None = None
+    """Set whose database PCA is fitted on, at most 16,384 images (paper: Pitts30k train); none: each set's own."""
+    pca_whiten: bool = False
+    """Scale PCA's directions to unit variance (published: no)."""
+    search: Literal["exact", "ivfpq", "hnsw"] = "exact"
+    """Exact L2 search, or a faiss approximation for large sets, whose recall against exact is measured and printed."""
 
 
 @dataclass(frozen=True)
@@ -206,6 +218,8 @@ class TrainConfig:
     """Linear warm-up in steps (published: 0)."""
     clip: float | None = None
     """Largest norm of the gradient; none: no clipping (published: none)."""
+    validate_first: bool = True
+    """Evaluate the untrained model before the first step, so that a run shows what training added."""
     patience: int = 3
     """Stop after this many epochs without a better validation R@5 (paper: 3); 0 never stops early."""
     encode_chunk: int | None = None
@@ -224,6 +238,8 @@ class TrainConfig:
     overwrite); or the path of a checkpoint."""
     log_every: int = 10
     """Steps between two progress lines and metric records."""
+    timeout: float = 600.0
+    """Seconds a rank waits for the others in a collective before the job ends with an error."""
     log_samples: bool = False
     """Write the sample keys of each step to samples.rank<r>.jsonl, the proof that nothing is repeated or skipped."""
 
