@@ -1,0 +1,158 @@
+"""Adapters: small trainable bottlenecks added to the frozen MLP of a block (paper, section 3.3).
+
+Invariant: an adapter maps tokens [b, 1 + G*G, D] to the same shape; the class token skips the convolutions but
+takes part in the skip sum (so under a skip it enters the last Linear doubled, as published). The last Linear
+starts at zero: training starts from the released model's own output.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.config import AdapterConfig
+from pipeline.model.batch_norm import GlobalBatchNorm2d
+from shards.errors import UsageError
+
+NORM_EPS = 1e-3  # published: BatchNorm2d(eps=0.001)
+
+
+class AdaptedMLP(nn.Module):
+    """`mlp(x) + s * adapter(x)`; the block applies its LayerScale to the sum, as published."""
+
+    def __init__(self, mlp: nn.Module, adapter: nn.Module, scale: float) -> None:
+        super().__init__()
+        self.mlp = mlp
+        self.adapter = adapter
+        self.scale = scale
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[b, T, D] -> [b, T, D]."""
+        out: Tensor = self.mlp(x) + self.scale * self.adapter(x)
+        return out
+
+
+class ConvNorm(nn.Module):
+    """Convolution of odd size -> normalisation -> ReLU, same height and width."""
+
+    def __init__(self, channels: int, out: int, kernel: int, norm: str) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, out, kernel, padding=kernel // 2)
+        self.norm = NORMS[norm](out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[b, channels, H, W] -> [b, out, H, W]."""
+        return torch.relu(self.norm(self.conv(x)))
+
+
+def _group_norm(channels: int) -> nn.GroupNorm:
+    groups = max(g for g in range(1, 9) if channels % g == 0)
+    return nn.GroupNorm(groups, channels, eps=NORM_EPS)
+
+
+NORMS: dict[str, Callable[[int], nn.Module]] = {
+    "batch": lambda channels: GlobalBatchNorm2d(channels, eps=NORM_EPS, momentum=0.1),
+    "group": _group_norm,
+    "none": lambda channels: nn.Identity(),
+}
+
+
+class VanillaAdapter(nn.Module):
+    """Linear -> ReLU -> Linear."""
+
+    def __init__(self, dim: int, width: int) -> None:
+        super().__init__()
+        self.down = nn.Linear(dim, width)
+        self.up = nn.Linear(width, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[b, T, D] -> [b, T, D]."""
+        out: Tensor = self.up(torch.relu(self.down(x)))
+        return out
+
+
+class ConvAdapter(nn.Module):
+    """Linear -> ReLU -> parallel convolution paths over the patch map, concatenated (+ skip) -> Linear.
+
+    Args:
+        dim: token width D.
+        width: bottleneck width; the paths' output channels add up to it.
+        paths: for each path its convolutions as (output channels, kernel).
+        skip: whether the input of the paths is added to their output.
+        norm: "batch", "group" or "none".
+    """
+
+    def __init__(self, dim: int, width: int, paths: list[list[tuple[int, int]]], skip: bool, norm: str) -> None:
+        super().__init__()
+        self.down = nn.Linear(dim, width)
+        self.paths = nn.ModuleList(_path(width, path, norm) for path in paths)
+        self.up = nn.Linear(width, dim)
+        self.skip = skip
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[b, 1 + G*G, D] -> [b, 1 + G*G, D]."""
+        hidden = torch.relu(self.down(x))
+        side = round((hidden.shape[1] - 1) ** 0.5)
+        grid = hidden[:, 1:].transpose(1, 2).unflatten(2, (side, side))  # [b, width, G, G]
+        maps = torch.cat([path(grid) for path in self.paths], dim=1)
+        mixed = torch.cat((hidden[:, :1], maps.flatten(2).transpose(1, 2).to(hidden.dtype)), dim=1)
+        out: Tensor = self.up(mixed + hidden if self.skip else mixed)
+        return out
+
+
+def _path(width: int, convolutions: list[tuple[int, int]], norm: str) -> nn.Module:
+    channels = [width, *(out for out, _ in convolutions)]
+    steps = [ConvNorm(channels[i], out, kernel, norm) for i, (out, kernel) in enumerate(convolutions)]
+    return steps[0] if len(steps) == 1 else nn.Sequential(*steps)
+
+
+def paths_of(kind: str, width: int, reduced: int) -> list[list[tuple[int, int]]]:
+    """The convolution paths of an adapter kind, as (output channels, kernel) lists.
+
+    mulconv is the paper's figure 3(b): half the width from 1x1, a quarter each from 3x3 and 5x5 behind a 1x1
+    reduction. The single kernels (supplement, section 12) give the whole width from one path, 3x3 and 5x5 behind
+    the same reduction; `conv` is conv3x3 whose skip the caller leaves out.
+    """
+    if kind == "mulconv":
+        quarter = width // 4
+        return [[(width - 2 * quarter, 1)], [(reduced, 1), (quarter, 3)], [(reduced, 1), (quarter, 5)]]
+    kernel = {"conv1x1": 1, "conv": 3, "conv3x3": 3, "conv5x5": 5}[kind]
+    return [[(width, 1)]] if kernel == 1 else [[(reduced, 1), (width, kernel)]]
+
+
+def build_adapter(config: AdapterConfig, dim: int) -> nn.Module:
+    """One block's adapter for token width `dim`, initialised.
+
+    Raises:
+        UsageError: a bottleneck too narrow for its paths.
+    """
+    width = int(dim * config.ratio)
+    if width < 4:
+        raise UsageError(f"adapter.ratio {config.ratio} leaves {width} of {dim} channels: at least 4 are needed")
+    adapter: VanillaAdapter | ConvAdapter
+    if config.kind == "vanilla":
+        adapter = VanillaAdapter(dim, width)
+    else:
+        paths = paths_of(config.kind, width, config.reduced)
+        adapter = ConvAdapter(dim, width, paths, skip=config.kind != "conv", norm=config.norm)
+    _initialise(adapter, config.init)
+    return adapter
+
+
+@torch.no_grad()
+def _initialise(adapter: VanillaAdapter | ConvAdapter, init: str) -> None:
+    nn.init.trunc_normal_(adapter.down.weight, std=0.02)
+    nn.init.zeros_(adapter.down.bias)
+    nn.init.zeros_(adapter.up.weight)
+    nn.init.zeros_(adapter.up.bias)
+    for module in adapter.modules():
+        if not isinstance(module, nn.Conv2d):
+            continue
+        if init == "published":  # every output channel alike: they stay alike for ever
+            for tensor in module.parameters():
+                nn.init.constant_(tensor, 1e-5)
+        else:
+            nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+            module.bias.zero_()  # type: ignore[union-attr]

@@ -1,0 +1,191 @@
+"""The image encoder: the transformers library's DINOv2 with adapters set in beside the MLP of every block.
+
+Invariant: the stored position embedding stays the parameter it was released as; what the tokens get added is its
+resize to the input's grid, made once where the embedding is frozen and in every forward where it is trained, so
+the library never interpolates at run time. The mask token of the released weights is kept, frozen and unused, so
+that parameter counts are those of the released model.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pipeline.config import BackboneConfig
+from pipeline.model.adapters import AdaptedMLP
+from shards.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Width, depth and shapes of a vision transformer."""
+
+    dim: int
+    depth: int
+    heads: int
+    patch: int = 14
+    mlp_ratio: int = 4
+    pretrain_grid: int = 37
+    swiglu: bool = False
+
+
+SIZES: dict[str, Sizes] = {
+    "dinov2_vits14": Sizes(384, 12, 6),
+    "dinov2_vitb14": Sizes(768, 12, 12),
+    "dinov2_vitl14": Sizes(1024, 24, 16),
+    "dinov2_vitg14": Sizes(1536, 40, 24, swiglu=True),
+}
+
+
+def sizes(config: BackboneConfig) -> Sizes:
+    """The sizes behind a backbone's name; `custom` takes them from the config's fields.
+
+    Raises:
+        UsageError: heads that do not divide the width.
+    """
+    if config.name != "custom":
+        return SIZES[config.name]
+    if config.dim % config.heads:
+        raise UsageError(f"backbone.dim {config.dim} is not a multiple of backbone.heads {config.heads}")
+    return Sizes(config.dim, config.depth, config.heads, config.patch, config.mlp_ratio, config.pretrain_grid)
+
+
+def resize_positions(stored: Tensor, grid: int) -> Tensor:
+    """The position embedding on another grid, as DINOv2 resizes it: [1, 1 + S*S, D] -> [1, 1 + grid*grid, D].
+
+    Bicubic without antialias, `align_corners=False`, with the scale (grid + 0.1) / S rather than the size: the
+    offset is DINOv2's guard against rounding, and it shifts the sampling points, so it belongs to the weights.
+    In float32, like the published code; a trained float64 embedding stays float64 so its gradient loses no digits.
+    """
+    side = round((stored.shape[1] - 1) ** 0.5)
+    if side == grid:
+        return stored
+    precise = torch.float64 if stored.dtype == torch.float64 and stored.requires_grad else torch.float32
+    patches = stored[:, 1:].to(precise).reshape(1, side, side, -1).permute(0, 3, 1, 2)
+    scale = (grid + 0.1) / side
+    with torch.autocast(stored.device.type, enabled=False):
+        patches = F.interpolate(patches, scale_factor=(scale, scale), mode="bicubic", align_corners=False)
+    patches = patches.permute(0, 2, 3, 1).flatten(1, 2).to(stored.dtype)
+    return torch.cat((stored[:, :1], patches), dim=1)
+
+
+class Embeddings(nn.Module):
+    """Class token, patch projection and position embedding; takes the place of the library's embeddings module."""
+
+    def __init__(self, library: nn.Module, grid: int) -> None:
+        super().__init__()
+        self.grid = grid
+        self.cls_token: nn.Parameter = library.cls_token  # type: ignore[assignment]
+        self.mask_token: nn.Parameter = library.mask_token  # type: ignore[assignment]
+        self.position_embeddings: nn.Parameter = library.position_embeddings  # type: ignore[assignment]
+        self.patch_embeddings: nn.Module = library.patch_embeddings  # type: ignore[assignment]
+        self.register_buffer("resized", None, persistent=False)
+        self.register_load_state_dict_post_hook(lambda module, keys: module.refresh())
+        self.refresh()
+
+    @torch.no_grad()
+    def refresh(self) -> None:
+        """Resizes the stored embedding anew; called when weights were loaded."""
+        frozen = self.position_embeddings.detach()
+        self.resized = resize_positions(frozen, self.grid)
+
+    def forward(self, pixel_values: Tensor, **_: Any) -> Tensor:
+        """[b, 3, S, S] -> [b, 1 + G*G, D]."""
+        patches = self.patch_embeddings(pixel_values)
+        trained = self.position_embeddings.requires_grad
+        positions = resize_positions(self.position_embeddings, self.grid) if trained else self.resized
+        return torch.cat((self.cls_token.expand(len(patches), -1, -1), patches), dim=1) + positions
+
+
+class Backbone(nn.Module):
+    """DINOv2 with adapters: [b, 3, S, S] normalised images -> [b, 1 + G*G, D] tokens after the final LayerNorm.
+
+    Args:
+        config: name or sizes, weights, attention implementation.
+        image_size: side of the input in pixels, a multiple of the patch.
+        make_adapter: builds one block's adapter from the width D, or None for no adapters.
+        scale: the factor s on the adapter (paper, Eq. 4).
+
+    Raises:
+        UsageError: an input size that is no multiple of the patch, weights that do not fit, an attention
+            implementation that is not installed.
+    """
+
+    def __init__(
+        self,
+        config: BackboneConfig,
+        image_size: int,
+        make_adapter: Callable[[int], nn.Module] | None,
+        scale: float,
+    ) -> None:
+        super().__init__()
+        size = sizes(config)
+        if image_size % size.patch or image_size < size.patch:
+            raise UsageError(f"data.image_size {image_size} is not a multiple of the backbone's patch {size.patch}")
+        self.dim, self.depth, self.grid = size.dim, size.depth, image_size // size.patch
+        # with released weights the random start would only cost time: shapes first, tensors from the file
+        with torch.device("meta") if config.weights else contextlib.nullcontext():
+            self.vit: Any = _library_model(size, config)
+            self.vit.embeddings = Embeddings(self.vit.embeddings, self.grid)
+        if config.weights:
+            from pipeline.model.pretrained import load_backbone
+
+            load_backbone(self, config.weights, config.name)
+        if make_adapter is not None:
+            for block in self.blocks:
+                block.mlp = AdaptedMLP(block.mlp, make_adapter(size.dim), scale)
+
+    @property
+    def blocks(self) -> list[Any]:
+        """The transformer blocks in order."""
+        return list(self.vit.encoder.layer)
+
+    def adapters(self) -> list[nn.Module]:
+        """The adapters in block order; empty without adapters."""
+        return [block.mlp.adapter for block in self.blocks if isinstance(block.mlp, AdaptedMLP)]
+
+    def freeze(self, train: str, last_blocks: int) -> None:
+        """Sets what is trained: "adapters", "full", "frozen" or "last" (the last blocks with their adapters and the
+        final norm). The mask token never is: it takes part in nothing, and DDP wants no idle trainable parameter."""
+        self.requires_grad_(train == "full")
+        if train == "adapters":
+            for adapter in self.adapters():
+                adapter.requires_grad_(True)
+        elif train == "last":
+            if not 1 <= last_blocks <= self.depth:
+                raise UsageError(f"model.last_blocks {last_blocks} must lie between 1 and the depth {self.depth}")
+            for block in (*self.blocks[-last_blocks:], self.vit.layernorm):
+                block.requires_grad_(True)
+        self.vit.embeddings.mask_token.requires_grad_(False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """[b, 3, S, S] -> [b, 1 + G*G, D]: class token first, then patches row by row."""
+        tokens: Tensor = self.vit(pixel_values=images).last_hidden_state
+        return tokens
+
+
+def _library_model(size: Sizes, config: BackboneConfig) -> Any:
+    from transformers import Dinov2Config, Dinov2Model  # four seconds: only where a model is built
+
+    settings: dict[str, Any] = dict(
+        hidden_size=size.dim,
+        num_hidden_layers=size.depth,
+        num_attention_heads=size.heads,
+        mlp_ratio=size.mlp_ratio,
+        image_size=size.pretrain_grid * size.patch,
+        patch_size=size.patch,
+        use_swiglu_ffn=size.swiglu,
+        layerscale_value=config.layerscale,
+        attn_implementation=config.attention,
+    )
+    try:
+        return Dinov2Model(Dinov2Config(**settings))
+    except (ImportError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise UsageError(f"backbone.attention {config.attention} cannot be used here: {reason}") from error

@@ -1,0 +1,88 @@
+"""The cross-image encoder: attention over the images of the batch, region by region (paper, section 3.2, Eq. 3).
+
+Invariant: in training every image attends to the global batch, whatever the number of ranks; in evaluation the
+images given are one group on this rank alone. Cost a rank and layer: attention of its own b queries against the B
+gathered keys and values, one all-gather of B*R*2D numbers, one reduce-scatter of the same size backward.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pipeline.config import CrossImageConfig
+from pipeline.distributed import gather
+from shards.errors import UsageError
+
+
+class CrossImageAttention(nn.Module):
+    """Multi-head self-attention over images; parameters named and started as in `nn.MultiheadAttention`."""
+
+    def __init__(self, dim: int, heads: int, dropout: float) -> None:
+        super().__init__()
+        self.heads = heads
+        self.dropout = dropout
+        self.in_proj_weight = nn.Parameter(torch.empty(3 * dim, dim))
+        self.in_proj_bias = nn.Parameter(torch.zeros(3 * dim))
+        self.out_proj = nn.Linear(dim, dim)
+        nn.init.xavier_uniform_(self.in_proj_weight)
+        nn.init.zeros_(self.out_proj.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[b, R, D] -> [b, R, D]: each region's b images (queries) over that region's B images (keys, values)."""
+        dim = x.shape[-1]
+        query, key_value = F.linear(x, self.in_proj_weight, self.in_proj_bias).split((dim, 2 * dim), dim=-1)
+        if self.training:
+            # projected on the rank that owns the image, then gathered once: the projection is not repeated W times
+            key_value = gather(key_value)
+        key, value = key_value.split(dim, dim=-1)
+        query, key, value = self._by_region(query), self._by_region(key), self._by_region(value)
+        dropout = self.dropout if self.training else 0.0
+        attended = F.scaled_dot_product_attention(query, key, value, dropout_p=dropout)  # [R, heads, b, D / heads]
+        out: Tensor = self.out_proj(attended.permute(2, 0, 1, 3).flatten(2))
+        return out
+
+    def _by_region(self, x: Tensor) -> Tensor:
+        """[n, R, D] -> [R, heads, n, D / heads]: the images become the sequence."""
+        return x.unflatten(-1, (self.heads, -1)).permute(1, 2, 0, 3)
+
+
+class CrossImageLayer(nn.Module):
+    """One post-norm transformer encoder layer with exact GELU; parameters as in `nn.TransformerEncoderLayer`."""
+
+    def __init__(self, dim: int, config: CrossImageConfig) -> None:
+        super().__init__()
+        self.self_attn = CrossImageAttention(dim, config.heads, config.dropout)
+        self.linear1 = nn.Linear(dim, config.feedforward)
+        self.linear2 = nn.Linear(config.feedforward, dim)
+        self.norm1 = nn.LayerNorm(dim)
+        self.norm2 = nn.LayerNorm(dim)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[b, R, D] -> [b, R, D]."""
+        x = self.norm1(x + self.dropout(self.self_attn(x)))
+        hidden = self.dropout(F.gelu(self.linear1(x)))
+        out: Tensor = self.norm2(x + self.dropout(self.linear2(hidden)))
+        return out
+
+
+class CrossImageEncoder(nn.Module):
+    """Layers shared by all regions: [b, R, D] -> [b, R, D]. No positional encoding, no final norm.
+
+    Raises:
+        UsageError: heads that do not divide the width.
+    """
+
+    def __init__(self, dim: int, config: CrossImageConfig) -> None:
+        super().__init__()
+        if dim % config.heads:
+            raise UsageError(f"cross_image.heads {config.heads} does not divide the token width {dim}")
+        self.layers = nn.ModuleList(CrossImageLayer(dim, config) for _ in range(config.layers))
+
+    def forward(self, regions: Tensor) -> Tensor:
+        """[b, R, D] -> [b, R, D]."""
+        for layer in self.layers:
+            regions = layer(regions)
+        return regions

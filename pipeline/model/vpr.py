@@ -1,0 +1,119 @@
+"""The assembled model: images -> regional features -> descriptors, with a seam between the two steps.
+
+Invariant: `encode` looks at one image at a time (but for BatchNorm statistics in training), `correlate` looks
+across the images: in `train()` mode at the global batch of all ranks, in `eval()` mode at the images given, as one
+group on this rank. So the descriptor of an image depends on its group, and never on how a group is split over ranks.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from pipeline.config import ModelConfig
+from pipeline.model.adapters import build_adapter
+from pipeline.model.backbone import Backbone
+from pipeline.model.batch_norm import GlobalBatchNorm2d
+from pipeline.model.cross_image import CrossImageEncoder
+from pipeline.model.pooling import Pooling, at_least_float32
+from shards.errors import UsageError
+
+
+class PlaceModel(nn.Module):
+    """Backbone, pooling and cross-image encoder as one; see `build_model`.
+
+    Attributes:
+        config, image_size: what it was built from.
+        regions: R, regional features of an image.
+        descriptor_dim: R * D, length of a descriptor.
+    """
+
+    def __init__(self, config: ModelConfig, image_size: int) -> None:
+        super().__init__()
+        self.config = config
+        self.image_size = image_size
+        adapter = config.adapter
+        make = (lambda dim: build_adapter(adapter, dim)) if adapter.kind != "none" else None
+        self.backbone = Backbone(config.backbone, image_size, make, adapter.scale)
+        self.backbone.freeze(config.train, config.last_blocks)
+        self.pooling = Pooling(config.pooling, self.backbone.grid)
+        self.cross_image = CrossImageEncoder(self.backbone.dim, config.cross_image)
+        self.regions = self.pooling.regions
+        self.descriptor_dim = self.regions * self.backbone.dim
+
+    def encode(self, images: Tensor, chunk: int | None = None) -> Tensor:
+        """Regional features of normalised images: [b, 3, S, S] -> [b, R, D].
+
+        Args:
+            images: float, ImageNet-normalised, S = `image_size`.
+            chunk: images encoded at a time; under gradient each chunk keeps its input alone and is recomputed in
+                backward, so peak memory depends on the chunk and not on b. The result is the same.
+
+        Raises:
+            UsageError: images of another size; chunks where training BatchNorm would see them one by one.
+        """
+        if images.ndim != 4 or images.shape[-2:] != (self.image_size, self.image_size):
+            raise UsageError(
+                f"the model takes images [b, 3, {self.image_size}, {self.image_size}], got {[*images.shape]}"
+            )
+        if chunk is None:
+            return self._regions(images)
+        if chunk < 1:
+            raise UsageError(f"train.encode_chunk {chunk} must be at least 1")
+        if self.training and any(isinstance(m, GlobalBatchNorm2d) for m in self.modules()):
+            raise UsageError(
+                f"train.encode_chunk {chunk} does not go with adapter.norm batch: BatchNorm would normalise each chunk "
+                "by itself instead of the global batch; choose adapter.norm group or none, or leave encode_chunk out"
+            )
+        parts = images.split(chunk)
+        if torch.is_grad_enabled():
+            return torch.cat([checkpoint(self._regions, part, use_reentrant=False) for part in parts])
+        return torch.cat([self._regions(part) for part in parts])
+
+    def _regions(self, images: Tensor) -> Tensor:
+        regions: Tensor = self.pooling(self.backbone(images))
+        return regions
+
+    def correlate(self, regions: Tensor) -> Tensor:
+        """Descriptors of the images of a group: [b, R, D] -> [b, R*D], of unit length, float32 at least."""
+        related = self.cross_image(regions)
+        with torch.autocast(regions.device.type, enabled=False):
+            return F.normalize(at_least_float32(related).flatten(1), dim=-1)
+
+    def forward(self, images: Tensor, chunk: int | None = None) -> Tensor:
+        """`correlate(encode(images, chunk))`: [b, 3, S, S] -> [b, R*D]."""
+        return self.correlate(self.encode(images, chunk))
+
+
+def build_model(config: ModelConfig, image_size: int) -> PlaceModel:
+    """The model of a config for square inputs of `image_size` pixels, in train mode, parts frozen as configured.
+
+    Random parts are drawn from torch's global generator: seed it first.
+
+    Raises:
+        UsageError: settings that do not fit each other, or weights that do not fit the backbone.
+    """
+    return PlaceModel(config, image_size)
+
+
+def parameter_counts(model: PlaceModel) -> dict[str, int]:
+    """Parameters by part: total, trainable, backbone, adapters, cross_image, pooling.
+
+    The paper's model gives 106,761,665 / 20,181,185 / 86,580,480 / 9,153,216 / 11,027,968 / 1: the backbone with
+    its stored 37 x 37 position embedding and its mask token, as released.
+    """
+
+    def count(*modules: nn.Module) -> int:
+        return sum(p.numel() for module in modules for p in module.parameters())
+
+    adapters = count(*model.backbone.adapters())
+    return {
+        "total": count(model),
+        "trainable": sum(p.numel() for p in model.parameters() if p.requires_grad),
+        "backbone": count(model.backbone) - adapters,
+        "adapters": adapters,
+        "cross_image": count(model.cross_image),
+        "pooling": count(model.pooling),
+    }
