@@ -29,7 +29,7 @@ class Progress:
         self, label: str, total: int | None, unit: str = "it", every: float = 10.0, enabled: bool = True
     ) -> None:
         self.label, self.total, self.unit, self.every, self.enabled = label, total, unit, every, enabled
-        self.done = 0
+        self.done = self._before = 0
         self._start = self._last = time.monotonic()
         self._bar = None
         if enabled and sys.stderr.isatty():
@@ -54,6 +54,12 @@ class Progress:
             self._last = time.monotonic()
             self._line(note)
 
+    def resume_at(self, done: int) -> None:
+        """Counts `done` units as finished earlier; the rate leaves them out."""
+        self.done = self._before = done
+        if self._bar is not None:
+            self._bar.n = self._bar.initial = done
+
     def close(self, failed: bool = False) -> None:
         """Ends the bar, or prints the closing plain line."""
         if self._bar is not None:
@@ -65,7 +71,7 @@ class Progress:
         seconds = max(time.monotonic() - self._start, 1e-9)
         of = f"/{self.total:,}" if self.total is not None else ""
         print(
-            f"{self.label}: {self.done:,}{of} {self.unit}, {self.done / seconds:,.0f} a second  {note}".rstrip(),
+            f"{self.label}: {self.done:,}{of} {self.unit}, {(self.done - self._before) / seconds:,.1f} a second  {note}".rstrip(),
             file=sys.stderr,
             flush=True,
         )

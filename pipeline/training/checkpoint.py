@@ -1,0 +1,208 @@
+"""Checkpoints: folders that are either complete or absent, written once, engine-independent.
+
+    outputs/<run>/checkpoints/step-00000123/{model.safetensors, optimizer.safetensors, state.json}
+    outputs/<run>/checkpoints/last -> step-00000123      best -> step-00000100
+
+Invariant: a kill at any moment leaves the previous checkpoint readable. A folder is written under a temporary name,
+synced and renamed once; `last` and `best` are symbolic links replaced by one rename. The tensors are whole (never
+shards) and named as in the model, so any engine and any number of ranks can read what another wrote; nothing in here
+is pickled. Randomness needs no state: it is keyed by (seed, epoch, step, rank), see `trainer`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pipeline.config import RunConfig, flatten
+from shards.errors import DataError, Diverged, UsageError
+
+# Settings a resumed run may change: they decide where, how long and how fast, never what a step computes.
+FREE = (
+    "name", "output", "tracking.", "validate.", "data.shards", "data.workers", "data.prefetch", "data.cache",
+    "train.epochs", "train.steps", "train.patience", "train.encode_chunk", "train.compile", "train.engine",
+    "train.save_every", "train.keep", "train.resume", "train.log_every", "train.log_samples", "train.timeout",
+    "train.validate_first", "model.backbone.attention", "model.backbone.weights",
+)  # fmt: skip
+
+
+@dataclass
+class RunState:
+    """Where a run stands; the JSON in a checkpoint.
+
+    Attributes:
+        step: optimiser steps taken.
+        epoch: the epoch being read, from 0.
+        cursor: global batches of that epoch already trained on.
+        best: best validation figure so far, percent, and the step it belongs to.
+        stale: epochs since then.
+        finished: why the run ended ("epochs", "steps", "patience"), or "".
+        run_id: MLflow run, "" when not recorded.
+        index: digest of the shard set's index.
+        world_size: ranks that wrote it (informative; any number may continue).
+        validated: the newest validation, metric name -> value.
+        start: the same before the first step, {} where it was not measured.
+        scaler: loss scale of fp16, empty otherwise.
+    """
+
+    step: int = 0
+    epoch: int = 0
+    cursor: int = 0
+    best: float | None = None
+    best_step: int | None = None
+    stale: int = 0
+    finished: str = ""
+    run_id: str = ""
+    index: str = ""
+    world_size: int = 1
+    validated: dict[str, float] = dataclasses.field(default_factory=dict)
+    start: dict[str, float] = dataclasses.field(default_factory=dict)
+    scaler: dict[str, float] = dataclasses.field(default_factory=dict)
+
+
+def folder(run: Path, step: int) -> Path:
+    """Where the checkpoint of a step lies."""
+    return run / "checkpoints" / f"step-{step:08d}"
+
+
+def write(
+    run: Path, state: RunState, config: RunConfig, model: dict[str, Tensor], optimizer: dict[str, Tensor]
+) -> Path:
+    """Writes one checkpoint and points `last` at it. Called on one rank, with whole tensors on the CPU.
+
+    Raises:
+        Diverged: a weight is not finite; nothing is written and the last good checkpoint stays.
+    """
+    from safetensors.torch import save_file
+
+    for name, tensor in model.items():
+        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+            raise Diverged(f"weight {name} is not finite at step {state.step}; the last good checkpoint is kept")
+    target = folder(run, state.step)
+    temporary = target.with_name(f".writing-{target.name}-{os.getpid()}")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    header = {"config": json.dumps(flatten(config)), "format": "pt"}
+    save_file({k: v.contiguous() for k, v in model.items()}, temporary / "model.safetensors", metadata=header)
+    save_file({k: v.contiguous() for k, v in optimizer.items()}, temporary / "optimizer.safetensors")
+    (temporary / "state.json").write_text(json.dumps(dataclasses.asdict(state), indent=1) + "\n")
+    for file in temporary.iterdir():
+        sync(file)
+    sync(temporary)
+    if target.exists():  # the same step again (an epoch's end that was also a save_every): the newer state wins
+        stale = target.with_name(f".replaced-{target.name}-{os.getpid()}")
+        target.rename(stale)
+        temporary.rename(target)
+        shutil.rmtree(stale)
+    else:
+        temporary.rename(target)
+    point(run, "last", target)
+    return target
+
+
+def point(run: Path, name: str, target: Path) -> None:
+    """Points the link `name` ("last", "best") at a checkpoint, by one rename."""
+    link = run / "checkpoints" / name
+    temporary = link.with_name(f".{name}-{os.getpid()}")
+    temporary.unlink(missing_ok=True)
+    temporary.symlink_to(target.name)
+    temporary.replace(link)
+    sync(link.parent)
+
+
+def sync(path: Path) -> None:
+    """Forces a file's bytes, or a folder's names, to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def prune(run: Path, keep: int) -> None:
+    """Removes all but the newest `keep` checkpoints, the one `best` points at, and left-overs of killed writes."""
+    parent = run / "checkpoints"
+    kept = {parent / (parent / name).readlink() for name in ("last", "best") if (parent / name).is_symlink()}
+    steps = sorted(p for p in parent.glob("step-*") if p.is_dir())
+    for path in [p for p in steps[: max(0, len(steps) - keep)] if p not in kept]:
+        doomed = path.with_name(f".removing-{path.name}")  # renamed first: a half-removed folder must not look whole
+        path.rename(doomed)
+    for leftover in [*parent.glob(".writing-*"), *parent.glob(".removing-*"), *parent.glob(".replaced-*")]:
+        shutil.rmtree(leftover)
+
+
+def find(run: Path, resume: str) -> Path | None:
+    """The checkpoint to continue from, or None to start anew.
+
+    Args:
+        run: the run's folder.
+        resume: "auto", "never", or the path of a checkpoint (or of a run folder).
+
+    Raises:
+        UsageError: "never" on a run that has checkpoints, or a path that holds none.
+    """
+    last = run / "checkpoints" / "last"
+    if resume == "never":
+        if last.exists():
+            raise UsageError(f"{run} already holds a run; choose another --name, or --train.resume auto to continue it")
+        return None
+    if resume == "auto":
+        # between the two renames of a rewrite only the newest complete folder may be there, not the link's target
+        complete = sorted((run / "checkpoints").glob("step-*/state.json"))
+        return last.resolve() if (last / "state.json").exists() else (complete[-1].parent if complete else None)
+    for path in (Path(resume), Path(resume) / "checkpoints" / "last"):
+        if (path / "state.json").exists():
+            found = path.resolve()
+            later = [p for p in (run / "checkpoints").glob("step-*") if p.name > found.name]
+            if found.parent == (run / "checkpoints").resolve() and later:
+                raise UsageError(f"{run} has gone on past {found.name}; continue from it under another --name")
+            return found
+    raise UsageError(f"{resume} holds no checkpoint (no state.json)")
+
+
+def read(path: Path) -> tuple[RunState, dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
+    """State, flat config, model tensors and optimiser tensors of a checkpoint.
+
+    Raises:
+        DataError: a file is missing or not what it should be.
+    """
+    from safetensors import SafetensorError, safe_open
+    from safetensors.torch import load_file
+
+    try:
+        state = RunState(**json.loads((path / "state.json").read_text()))
+        with safe_open(str(path / "model.safetensors"), framework="pt") as file:
+            config = json.loads(file.metadata()["config"])
+        return state, config, load_file(path / "model.safetensors"), load_file(path / "optimizer.safetensors")
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"checkpoint {path} cannot be read ({error}); remove it to resume from an older one") from error
+
+
+def check_same(saved: dict[str, Any], config: RunConfig, state: RunState, index: str) -> None:
+    """Refuses to continue a run under settings that would change what a step computes.
+
+    Raises:
+        UsageError: names the first setting that differs, with both values.
+    """
+    now = flatten(config)
+    for key in sorted(set(saved) | set(now)):
+        if any(key == free or (free.endswith(".") and key.startswith(free)) for free in FREE):
+            continue
+        if saved.get(key) != now.get(key):
+            raise UsageError(
+                f"cannot resume {config.name}: {key} was {saved.get(key)!r} and is now {now.get(key)!r}; "
+                "put it back, or choose another --name"
+            )
+    if state.index != index:
+        raise UsageError(
+            f"cannot resume {config.name}: the shards in {config.data.shards} are not those it started with "
+            f"(index {index[:12]}, was {state.index[:12]}); choose another --name"
+        )

@@ -1,0 +1,237 @@
+"""One face for every way of wrapping the model: one process, DDP, FSDP2, DeepSpeed ZeRO.
+
+Invariant: whatever the engine, gradients are the average over ranks of each rank's gradient (pipeline.distributed says
+why that is the gradient of the global batch), and `state` gives whole tensors under the model's own names, so a
+checkpoint does not know which engine or how many ranks wrote it.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.config import TrainConfig
+from pipeline.distributed import is_distributed, rank, world_size
+from shards.errors import UsageError
+
+BuildOptimizer = Callable[[Iterator[nn.Parameter]], torch.optim.Optimizer]
+
+
+class Engine:
+    """A model and its optimiser under data parallelism. This class serves one process and DDP.
+
+    Args:
+        accelerator: owns device, precision and wrapping.
+        model: on the CPU, identical on all ranks.
+        build: makes the optimiser over the parameters of the module it is given.
+        clip: largest gradient norm, or None.
+    """
+
+    name = "ddp"
+
+    def __init__(
+        self,
+        accelerator: Any,
+        model: nn.Module,
+        build: BuildOptimizer,
+        clip: float | None,
+    ) -> None:
+        self.accelerator, self.clip = accelerator, clip
+        self._wrap(model, build)
+
+    def _wrap(self, model: nn.Module, build: BuildOptimizer) -> None:
+        optimizer = build(model.parameters())
+        self.module, self.optimizer = self.accelerator.prepare(model, optimizer)
+
+    @property
+    def model(self) -> nn.Module:
+        """The model inside the wrapper."""
+        inner: nn.Module = self.accelerator.unwrap_model(self.module, keep_torch_compile=False)
+        return inner
+
+    def names(self) -> dict[str, nn.Parameter]:
+        """Trainable parameters by the model's names."""
+        return {n: p for n, p in self.model.named_parameters() if p.requires_grad}
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Tensor:
+        out: Tensor = self.module(*args, **kwargs)
+        return out
+
+    def step(self, loss: Tensor, rate: float) -> None:
+        """Backward, clip, update at this learning rate, clear gradients."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.accelerator.backward(loss)
+        if self.clip is not None:
+            self.accelerator.clip_grad_norm_(self.module.parameters(), self.clip)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def gradients(self, loss: Tensor) -> dict[str, Tensor]:
+        """The averaged gradients of `loss` as whole tensors (collective), cleared afterwards; for tests and tables."""
+        self.accelerator.backward(loss)
+        found = {n: _whole(p.grad).detach().cpu().clone() for n, p in self.names().items() if p.grad is not None}
+        self.optimizer.zero_grad(set_to_none=True)
+        return found
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Whole model tensors and optimiser tensors on the CPU (collective; complete on rank 0, empty elsewhere).
+
+        Optimiser tensors are named `<parameter>/<state>`, for example `cross_image.layers.0.linear1.weight/exp_avg`.
+        """
+        model = self._collect(self.model.state_dict().items())
+        inner = getattr(self.optimizer, "optimizer", self.optimizer)
+        moments = (
+            (f"{name}/{key}", value if isinstance(value, Tensor) else torch.tensor(float(value)))
+            for name, parameter in self.names().items()
+            for key, value in inner.state.get(parameter, {}).items()
+        )
+        return model, self._collect(moments)
+
+    def load(self, model: dict[str, Tensor], optimizer: dict[str, Tensor]) -> None:
+        """Puts whole tensors, as `state` gave them, into model and optimiser."""
+        self._load_model(model)
+        inner = getattr(self.optimizer, "optimizer", self.optimizer)
+        parameters = self.names()
+        for key, value in optimizer.items():
+            name, state = key.rsplit("/", 1)
+            parameter = parameters[name]
+            # the step counter stays on the CPU, where torch's own optimisers keep it
+            placed = value.clone() if value.ndim == 0 else _like(value, parameter)
+            inner.state[parameter][state] = placed
+
+    def _load_model(self, model: dict[str, Tensor]) -> None:
+        own = self.model.state_dict()
+        unknown = set(model) - set(own)
+        if unknown:
+            raise UsageError(f"the checkpoint holds {sorted(unknown)[0]}, which this model has not")
+        with torch.no_grad():
+            for name, value in model.items():
+                own[name].copy_(_like(value, own[name]))
+
+    @contextmanager
+    def plain(self) -> Iterator[nn.Module]:
+        """The whole model, unwrapped, in evaluation mode, usable on each rank alone; then training mode again."""
+        model = self.model
+        model.eval()
+        try:
+            yield model
+        finally:
+            model.train()
+
+    @staticmethod
+    def _collect(tensors: Any) -> dict[str, Tensor]:
+        keep = rank() == 0
+        found: dict[str, Tensor] = {}
+        for name, tensor in tensors:
+            whole = _whole(tensor)  # collective: every rank takes part, rank 0 keeps
+            if keep:
+                found[name] = whole.detach().cpu().clone()
+        return found
+
+
+class ShardedEngine(Engine):
+    """FSDP2: parameters, gradients and optimiser state sharded over ranks with `fully_shard`, block by block.
+
+    Called directly rather than through Accelerate, whose FSDP2 path does not exist on CPU; the same code then runs in
+    the tests and on GPUs.
+    """
+
+    name = "fsdp2"
+
+    def _wrap(self, model: nn.Module, build: BuildOptimizer) -> None:
+        from torch.distributed.device_mesh import init_device_mesh
+        from torch.distributed.fsdp import MixedPrecisionPolicy, fully_shard
+
+        device = self.accelerator.device
+        self._template = copy.deepcopy(model)
+        model = model.to(device)
+        mesh = init_device_mesh(device.type, (world_size(),))
+        precision = {"bf16": torch.bfloat16, "fp16": torch.float16}.get(self.accelerator.mixed_precision)
+        policy = MixedPrecisionPolicy(param_dtype=precision, reduce_dtype=torch.float32) if precision else None
+        options: dict[str, Any] = {"mesh": mesh, **({"mp_policy": policy} if policy else {})}
+        for module in model.modules():
+            if isinstance(module, nn.ModuleList):
+                for block in module:
+                    if any(True for _ in block.parameters()):
+                        fully_shard(block, **options)
+        fully_shard(model, **options)
+        self.module = model
+        self.optimizer = build(model.parameters())
+
+    @property
+    def model(self) -> nn.Module:
+        return self.module
+
+    @contextmanager
+    def plain(self) -> Iterator[nn.Module]:
+        # a sharded model cannot be called a different number of times on each rank, as evaluation does
+        sharded = self.module.state_dict()
+        self._template.to(self.accelerator.device)
+        with torch.no_grad():
+            for name, whole in self._template.state_dict().items():
+                whole.copy_(_whole(sharded[name]))
+        self._template.eval()
+        try:
+            yield self._template
+        finally:
+            self._template.to("cpu")
+
+
+def _whole(tensor: Any) -> Tensor:
+    """The full tensor of a sharded one (collective); any other as it is."""
+    full: Tensor = tensor.full_tensor() if hasattr(tensor, "full_tensor") else tensor
+    return full
+
+
+def _like(value: Tensor, target: Any) -> Tensor:
+    """`value` placed as `target` is: device, dtype, and its shard where the target is sharded."""
+    value = value.to(device=target.device, dtype=target.dtype)
+    if hasattr(target, "full_tensor"):
+        from torch.distributed.tensor import distribute_tensor
+
+        return distribute_tensor(value, target.device_mesh, target.placements)
+    return value.clone()
+
+
+def choose(setting: str) -> str:
+    """Which engine this launch asks for: "ddp", "fsdp2" or "deepspeed".
+
+    Raises:
+        UsageError: the setting contradicts the launch.
+    """
+    launched = "ddp"
+    if os.environ.get("ACCELERATE_USE_DEEPSPEED", "false").lower() == "true":
+        launched = "deepspeed"
+    elif os.environ.get("ACCELERATE_USE_FSDP", "false").lower() == "true":
+        launched = "fsdp2"
+    if setting != "auto" and launched == "deepspeed":
+        raise UsageError(f"train.engine is {setting}, but accelerate was launched with DeepSpeed; set it to auto")
+    chosen = launched if setting == "auto" else setting
+    if chosen == "fsdp2" and not is_distributed():
+        raise UsageError("engine fsdp2 shards over ranks and needs at least two; launch with --num_processes 2")
+    return chosen
+
+
+def build_engine(
+    config: TrainConfig, accelerator: Any, model: nn.Module, build: BuildOptimizer, micro_batch: int
+) -> Engine:
+    """The engine for this launch; `micro_batch` is b, images on this rank (DeepSpeed wants it said).
+
+    Raises:
+        UsageError: the engine cannot do what the config asks for.
+    """
+    chosen = choose(config.engine)
+    if chosen == "deepspeed":
+        from pipeline.training.zero import ZeroEngine
+
+        return ZeroEngine(accelerator, model, build, config.clip, micro_batch)
+    if chosen == "fsdp2" and accelerator.mixed_precision == "fp16":
+        raise UsageError("engine fsdp2 has no loss scaler for fp16; use bf16, or DDP")
+    return (ShardedEngine if chosen == "fsdp2" else Engine)(accelerator, model, build, config.clip)

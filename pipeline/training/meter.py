@@ -1,0 +1,100 @@
+"""What a person watches while training: step, loss, mined anchors, images a second, time spent waiting for data.
+
+Invariant: measuring adds no synchronisation of its own; the loss's value is fetched once a step by the loop.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import TypeVar
+
+from pipeline.training.checkpoint import RunState
+from shards.progress import Progress
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class Report:
+    """Means since the last report.
+
+    Attributes:
+        loss: of the global batch.
+        mined: percent of anchors with a mined pair.
+        images_per_second: over all ranks.
+        data_wait: percent of the time spent waiting for the loader.
+    """
+
+    loss: float
+    mined: float
+    images_per_second: float
+    data_wait: float
+
+
+class Meter:
+    """Times steps and shows a progress line; a context manager around an epoch.
+
+    Args:
+        images: in a global batch.
+        total: steps of the run.
+        state: of the run (its step and epoch are shown).
+        enabled: False on ranks that show nothing.
+    """
+
+    def __init__(self, images: int, total: int, state: RunState, enabled: bool) -> None:
+        self.images, self.state = images, state
+        self._bar = Progress(f"epoch {state.epoch + 1}", total, "steps", enabled=enabled)
+        self._bar.resume_at(state.step)
+        self._losses: list[float] = []
+        self._mined: list[float] = []
+        self._waited = 0.0
+        self._since = time.perf_counter()
+        self._shown: Report | None = None
+
+    def __enter__(self) -> Meter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._bar.close(failed=kind is not None)
+
+    def wait(self, loader: Iterable[Item]) -> Iterator[Item]:
+        """The loader's batches; the time spent in it counts as waiting."""
+        batches = iter(loader)
+        while True:
+            start = time.perf_counter()
+            try:
+                batch = next(batches)
+            except StopIteration:
+                return
+            self._waited += time.perf_counter() - start
+            yield batch
+
+    def record(self, loss: float, mined: float) -> None:
+        """One step's loss and share of anchors with a mined pair; moves the progress line."""
+        self._losses.append(loss)
+        self._mined.append(100 * mined)
+        now = self._current()
+        self._bar.advance(
+            1,
+            f"loss {now.loss:.4f}  mined {now.mined:.0f}%  {now.images_per_second:.0f} images/s  "
+            f"data wait {now.data_wait:.0f}%",
+        )
+
+    def report(self) -> Report:
+        """Means since the last report, and a new start."""
+        report = self._current()
+        self._losses, self._mined, self._waited, self._since = [], [], 0.0, time.perf_counter()
+        return report
+
+    def _current(self) -> Report:
+        n = max(1, len(self._losses))
+        seconds = max(time.perf_counter() - self._since, 1e-9)
+        return Report(
+            sum(self._losses) / n,
+            sum(self._mined) / n,
+            self.images * len(self._losses) / seconds,
+            100 * self._waited / seconds,
+        )

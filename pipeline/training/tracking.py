@@ -1,0 +1,169 @@
+"""Runs in MLflow: parameters, metrics by step, artifacts, checkpoints; a local SQLite store unless told otherwise.
+
+Invariant: only rank 0 records, a run that is resumed continues its MLflow run, and a metric's name carries the
+protocol it was measured under (`city.shuffled16.recall_at_1`; MLflow allows no `@`). Recording never changes what is
+computed; a store that cannot be reached is an error at the start, not a surprise at the end.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import time
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import RunConfig, flatten, to_dict
+from shards.errors import UsageError
+
+
+def store_uri(uri: str | None, output: str) -> str:
+    """The tracking store: the setting, else MLFLOW_TRACKING_URI, else `<output>/mlflow.db`."""
+    return uri or os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{Path(output).resolve() / 'mlflow.db'}"
+
+
+def open_client(uri: str) -> Any:
+    """A client of the store.
+
+    Raises:
+        UsageError: it cannot be reached or is not a store.
+    """
+    import logging
+
+    for noisy in ("alembic", "mlflow.store.db.utils", "mlflow.tracking"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "3")
+    from mlflow import MlflowClient
+    from mlflow.exceptions import MlflowException
+
+    if uri.startswith("sqlite:///"):
+        Path(uri.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
+    try:
+        client = MlflowClient(tracking_uri=uri)
+        client.search_experiments(max_results=1)
+        return client
+    except (MlflowException, OSError) as error:
+        raise UsageError(f"the MLflow store {uri} cannot be used: {str(error).splitlines()[0]}") from error
+
+
+def experiment_id(client: Any, uri: str, name: str, output: str) -> str:
+    """The experiment's id; it is created where it is missing, its artifacts beside a local store."""
+    found = client.get_experiment_by_name(name)
+    if found is not None:
+        return str(found.experiment_id)
+    local = uri.startswith("sqlite:")
+    location = (Path(output).resolve() / "mlartifacts" / name).as_uri() if local else None
+    return str(client.create_experiment(name, artifact_location=location))
+
+
+class Tracker:
+    """Records one training run.
+
+    Args:
+        config: of the run.
+        run_id: the MLflow run to continue, or "" for a new one.
+        enabled: False (other ranks, tracking.enabled false) records nothing.
+    """
+
+    def __init__(self, config: RunConfig, run_id: str = "", enabled: bool = True) -> None:
+        self.config, self.run_id = config, run_id
+        self._client: Any = None
+        if not enabled:
+            return
+        self.uri = store_uri(config.tracking.uri, config.output)
+        self._client = open_client(self.uri)
+        self._experiment = experiment_id(self._client, self.uri, config.tracking.experiment, config.output)
+        if run_id:
+            self._client.update_run(run_id, status="RUNNING")
+        else:
+            self._begin()
+
+    def _begin(self) -> None:
+        from mlflow.entities import Param
+
+        run = self._client.create_run(
+            self._experiment, run_name=self.config.name, tags={"run_folder": str(self._folder()), "kind": "training"}
+        )
+        self.run_id = run.info.run_id
+        values = [Param(key, str(value)) for key, value in flatten(self.config).items()]
+        self._client.log_batch(self.run_id, params=values)
+        self._client.log_dict(self.run_id, to_dict(self.config), "config.yaml")
+        self._client.log_dict(self.run_id, environment(), "environment.yaml")
+
+    def _folder(self) -> Path:
+        return Path(self.config.output) / self.config.name
+
+    def metrics(self, values: dict[str, float], step: int) -> None:
+        """Records metrics at a step, in the background."""
+        if self._client is None:
+            return
+        from mlflow.entities import Metric
+
+        now = int(time.time() * 1000)
+        entries = [Metric(name, float(value), now, step) for name, value in values.items()]
+        self._client.log_batch(self.run_id, metrics=entries, synchronous=False)
+
+    def tags(self, values: dict[str, str]) -> None:
+        """Sets tags of the run."""
+        for key, value in values.items() if self._client is not None else ():
+            self._client.set_tag(self.run_id, key, value)
+
+    def artifact(self, path: Path, folder: str | None = None) -> None:
+        """Stores a file, or a folder's files, with the run."""
+        if self._client is None:
+            return
+        if path.is_dir():
+            self._client.log_artifacts(self.run_id, str(path), folder)
+        else:
+            self._client.log_artifact(self.run_id, str(path), folder)
+
+    def checkpoint(self, path: Path, step: int, values: dict[str, float]) -> None:
+        """Registers a checkpoint folder as a logged model of the run, ranked by its validation figures."""
+        if self._client is None:
+            return
+        from mlflow.entities import LoggedModelStatus, Metric
+
+        model = self._client.create_logged_model(
+            self._experiment,
+            name=f"{self.config.name}-step-{step}",
+            source_run_id=self.run_id,
+            tags={"checkpoint": str(path), "step": str(step)},
+            model_type="checkpoint",
+        )
+        now = int(time.time() * 1000)
+        entries = [Metric(k, float(v), now, step, model_id=model.model_id) for k, v in values.items()]
+        if entries:
+            self._client.log_batch(self.run_id, metrics=entries)
+        self._client.finalize_logged_model(model.model_id, LoggedModelStatus.READY)
+
+    def close(self, status: str) -> None:
+        """Waits for what is still being written and ends the run: FINISHED, FAILED or KILLED (to be continued)."""
+        if self._client is None:
+            return
+        import mlflow
+
+        mlflow.flush_async_logging()
+        self._client.set_terminated(self.run_id, status=status)
+
+
+def environment() -> dict[str, Any]:
+    """Python, platform and the versions that matter for a result."""
+    wanted = (
+        "torch",
+        "accelerate",
+        "transformers",
+        "deepspeed",
+        "webdataset",
+        "pyarrow",
+        "faiss-cpu",
+        "numpy",
+        "pillow",
+    )
+    installed = {d.metadata["Name"].lower(): d.version for d in metadata.distributions() if d.metadata["Name"]}
+    return {
+        "python": sys.version.split()[0],
+        "platform": platform.platform(),
+        "packages": {name: installed[name] for name in wanted if name in installed},
+    }

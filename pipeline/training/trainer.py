@@ -1,0 +1,293 @@
+"""The training loop: load, step, save, validate; the global batch is its unit.
+
+Invariant: what a step computes is a function of (config, shards, weights before it) and not of the number of ranks,
+up to rounding (and up to dropout's masks, which are drawn for each rank's own images). All randomness is keyed by
+(seed, epoch, sample, view) for images and (seed, step, rank) for dropout, so a resumed run needs no generator state,
+repeats no place and skips none.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pipeline.config import RunConfig, to_dict
+from pipeline.data.images import normalise
+from pipeline.data.places import Batch, build_loader
+from pipeline.data.plan import plan
+from pipeline.distributed import any_rank, barrier, broadcast_object, rank, world_size
+from pipeline.training import checkpoint
+from pipeline.training.checkpoint import RunState
+from pipeline.training.engine import Engine, build_engine
+from pipeline.training.launch import stop_signals
+from pipeline.training.loss import MultiSimilarityLoss
+from pipeline.training.meter import Meter
+from pipeline.training.schedule import build_optimizer, learning_rate
+from pipeline.training.tracking import Tracker
+from pipeline.training.validation import Validation
+from shards.errors import DataError, Diverged, Preempted, UsageError
+from shards.index import read_index
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended.
+
+    Attributes:
+        run: its folder.
+        state: where it stands.
+        reason: "epochs", "steps", "patience" or "already finished".
+    """
+
+    run: Path
+    state: RunState
+    reason: str
+
+
+class Trainer:
+    """Trains one run from its config, from the start or from its last checkpoint.
+
+    Args:
+        config: the run.
+        accelerator: from `launch.start`.
+
+    Raises:
+        UsageError, DataError: the config does not fit the launch, the shards or the run being resumed.
+    """
+
+    def __init__(self, config: RunConfig, accelerator: Any) -> None:
+        from pipeline.model.vpr import build_model
+
+        self.config, self.accelerator = config, accelerator
+        self.main = rank() == 0
+        self.run = Path(config.output) / config.name
+        self.index = read_index(config.data.shards)
+        self.steps_per_epoch = len(self._plan(0).batches)
+        check_batch(config, self.steps_per_epoch)
+        self.total_steps = self.steps_per_epoch * config.train.epochs
+        if config.train.steps is not None:
+            self.total_steps = min(self.total_steps, config.train.steps)
+
+        torch.manual_seed(config.seed)
+        model = build_model(config.model, config.data.image_size)
+        self.state, saved = self._resume()
+        self.engine: Engine = build_engine(
+            config.train,
+            accelerator,
+            model,
+            lambda parameters: build_optimizer(config.train, parameters),
+            4 * config.data.places_per_batch // world_size(),
+        )
+        if saved is not None:
+            self.engine.load(*saved)
+        self.loss = MultiSimilarityLoss(
+            alpha=config.loss.alpha, beta=config.loss.beta, base=config.loss.base, margin=config.loss.margin
+        )
+        self.validation = Validation(config, accelerator.device) if config.validate.sets else None
+
+    def fit(self) -> Outcome:
+        """Trains to the end.
+
+        Raises:
+            Preempted: SIGTERM or SIGUSR1 came; the run is saved and continues with `--train.resume auto`.
+            Diverged: the loss is not finite; the last good checkpoint stays.
+            DataError: a shard or a validation image cannot be read.
+        """
+        if self.state.finished and self.state.step >= self.total_steps:
+            return Outcome(self.run, self.state, "already finished")
+        self._open()
+        status = "FAILED"
+        try:
+            with stop_signals() as self.stops:
+                if self.state.step == 0 and self.validation is not None and self.config.train.validate_first:
+                    self._validate()
+                while not (reason := self._ended()):
+                    self._epoch()
+            self.state.finished = reason
+            self._save()
+            status = "FINISHED"
+            return Outcome(self.run, self.state, reason)
+        except (Preempted, KeyboardInterrupt):
+            status = "KILLED"
+            raise
+        finally:
+            self.tracker.close(status)
+
+    def _epoch(self) -> None:
+        """The rest of the current epoch, then validation and a checkpoint."""
+        state, config = self.state, self.config
+        loader = build_loader(self.index, config.data, config.seed, state.epoch, state.cursor, rank(), world_size())
+        self.engine.model.train()
+        meter = Meter(config.data.places_per_batch * 4, self.total_steps, state, enabled=self.main)
+        with meter:
+            for batch in meter.wait(loader):
+                self._step(batch, meter)
+                if self._asked_to_stop():
+                    self._save()
+                    number = self.stops[0] if self.stops else "on another rank"
+                    raise Preempted(f"signal {number}: saved step {state.step}; start again to continue")
+                if state.step >= self.total_steps and state.cursor < self.steps_per_epoch:
+                    break  # train.steps falls inside the epoch
+                if state.step % config.train.save_every == 0 and state.cursor < self.steps_per_epoch:
+                    self._save()
+        if state.cursor >= self.steps_per_epoch:
+            state.epoch, state.cursor = state.epoch + 1, 0
+        if self.validation is not None:
+            self._validate()
+        self._save()
+
+    def _step(self, batch: Batch, meter: Meter) -> None:
+        state, config = self.state, self.config
+        torch.manual_seed(step_seed(config.seed, state.step, rank()))
+        images = normalise(batch.images.to(self.accelerator.device, non_blocking=True))
+        labels = batch.labels.to(self.accelerator.device, non_blocking=True)
+        with self.accelerator.autocast():
+            descriptors = self.engine(images, chunk=config.train.encode_chunk)
+        loss = self.loss(descriptors, labels)
+        value = loss.detach().item()  # the global batch's loss, the same on every rank
+        if not torch.isfinite(torch.tensor(value)):
+            raise Diverged(
+                f"the loss is {value} at step {state.step} (epoch {state.epoch}); the last good checkpoint is "
+                f"{self.run / 'checkpoints' / 'last'}; try a smaller --train.lr, --train.clip 1.0 or --train.warmup_steps"
+            )
+        rate = learning_rate(config.train, state.step, self.steps_per_epoch, self.total_steps)
+        self.engine.step(loss, rate)
+        state.step += 1
+        state.cursor += 1
+        if self.samples is not None:
+            self.samples.write(json.dumps({"step": state.step, "epoch": state.epoch, "samples": batch.keys}) + "\n")
+            self.samples.flush()
+        mined = self.loss.statistics()
+        meter.record(value, mined.anchors)
+        if state.step % config.train.log_every == 0 or state.step == self.total_steps:
+            report = meter.report()
+            self.tracker.metrics(
+                {
+                    "train.loss": report.loss,
+                    "train.mined_anchors": report.mined,
+                    "train.mined_positives": mined.positives,
+                    "train.mined_negatives": mined.negatives,
+                    "train.images_per_second": report.images_per_second,
+                    "train.data_wait": report.data_wait,
+                    "train.lr": rate,
+                    "train.epoch": state.epoch + state.cursor / self.steps_per_epoch,
+                },
+                state.step,
+            )
+
+    def _validate(self) -> None:
+        """Recall of the model as it is; keeps the best, counts the epochs without a better one."""
+        assert self.validation is not None
+        with self.engine.plain() as model:
+            values, score = self.validation.run(model, self.main)
+        self.state.validated = values
+        self.tracker.metrics(values, self.state.step)
+        if self.state.step == 0:
+            self.state.start = values
+            return
+        if self.state.best is None or score > self.state.best:
+            self.state.best, self.state.best_step, self.state.stale = score, self.state.step, 0
+        else:
+            self.state.stale += 1
+
+    def _save(self) -> None:
+        """One checkpoint (collective)."""
+        state = self.state
+        state.world_size = world_size()
+        model, optimizer = self.engine.state()
+        problem = None
+        if self.main:
+            try:
+                path = checkpoint.write(self.run, state, self.config, self.engine.model, model, optimizer)
+                if state.best_step == state.step or self.validation is None:
+                    checkpoint.point(self.run, "best", path)
+                    self.tracker.checkpoint(path.resolve(), state.step, state.validated)
+                checkpoint.prune(self.run, self.config.train.keep)
+            except (OSError, Diverged) as error:
+                problem = error
+        problem = broadcast_object(problem)
+        if isinstance(problem, OSError):
+            raise DataError(f"cannot write a checkpoint under {self.run}: {problem}")
+        if problem is not None:
+            raise problem
+
+    def _resume(self) -> tuple[RunState, Any]:
+        path = checkpoint.find(self.run, self.config.train.resume)
+        if path is None:
+            return RunState(index=self.index.digest), None
+        state, config, model, optimizer = checkpoint.read(path)
+        checkpoint.check_same(config, self.config, state, self.index.digest)
+        if path.parent.parent != self.run.resolve():
+            state.run_id = ""  # branched off another run: a run of its own in MLflow
+        return state, (model, optimizer)
+
+    def _open(self) -> None:
+        """The run's folder, its MLflow run and the sample log."""
+        config = self.config
+        note = self.run / "mlflow_run_id"
+        problem = None
+        if self.main:
+            self.run.mkdir(parents=True, exist_ok=True)
+            (self.run / "config.json").write_text(json.dumps(to_dict(config), indent=1) + "\n")
+            # a run killed before its first checkpoint left its id here
+            known = self.state.run_id or (note.read_text().strip() if note.exists() else "")
+            try:
+                self.tracker = Tracker(config, known, config.tracking.enabled)
+                self.state.run_id = self.tracker.run_id
+                note.write_text(self.tracker.run_id)
+            except UsageError as error:
+                problem = error
+        else:
+            self.tracker = Tracker(config, enabled=False)
+        problem = broadcast_object(problem)
+        if problem is not None:
+            raise problem
+        barrier()
+        path = self.run / f"samples.rank{rank()}.jsonl"
+        self.samples = path.open("a") if config.train.log_samples else None
+
+    def _ended(self) -> str:
+        """Why the run is over, or ""."""
+        state, train = self.state, self.config.train
+        if state.step >= self.total_steps:
+            return "steps" if train.steps is not None and state.step >= train.steps else "epochs"
+        if train.patience and state.stale >= train.patience:
+            return "patience"
+        return ""
+
+    def _asked_to_stop(self) -> bool:
+        return any_rank(bool(self.stops), self.accelerator.device)
+
+    def _plan(self, epoch: int) -> Any:
+        data = self.config.data
+        return plan(self.index, self.config.seed, epoch, data.places_per_batch, data.order, data.window_shards)
+
+
+def step_seed(seed: int, step: int, r: int) -> int:
+    """Seed of a step's dropout on a rank; distinct over (seed, step, rank) below 2^20 steps and 2^12 ranks a seed."""
+    return ((seed << 32) + (step << 12) + r) % (1 << 63)
+
+
+def check_batch(config: RunConfig, steps_per_epoch: int) -> None:
+    """Refuses a global batch that cannot be cut equally or never fills.
+
+    Raises:
+        UsageError: with the numbers.
+    """
+    places, w = config.data.places_per_batch, world_size()
+    if places % w:
+        raise UsageError(
+            f"data.places_per_batch {places} cannot be cut equally over {w} processes; use a multiple of {w}"
+        )
+    if steps_per_epoch == 0:
+        raise UsageError(f"the shards hold fewer than data.places_per_batch = {places} places; make the batch smaller")
+
+
+def summary(config: RunConfig, state: RunState) -> dict[str, Any]:
+    """What a finished run tells: its state and where it is recorded."""
+    return {"run": config.name, **asdict(state)}

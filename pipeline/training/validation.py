@@ -1,0 +1,50 @@
+"""Validation during training: the sets of the config, evaluated by the referee's own code.
+
+Invariant: the score that chooses the best checkpoint is R@5 of the first set under the first grouping (paper,
+section 4.2: R@5), as computed by `pipeline.evaluation`; nothing is measured twice in different ways.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from typing import Any
+
+from torch import nn
+
+from pipeline.config import RunConfig
+
+
+class Validation:
+    """Loads the validation sets once, evaluates a model on them whenever asked.
+
+    Args:
+        config: of the run; `config.validate` says sets and protocols.
+        device: where descriptors are computed.
+
+    Raises:
+        DataError: a set is missing or not laid out as documented.
+    """
+
+    def __init__(self, config: RunConfig, device: Any) -> None:
+        from pipeline.evaluation.datasets import load_set
+
+        # R@5 chooses the best checkpoint, whatever else is asked for
+        recalls = tuple(sorted({*config.validate.recalls, 5}))
+        self.config = dataclasses.replace(config.validate, recalls=recalls)
+        self.sets = [load_set(name, self.config) for name in config.validate.sets]
+        self.device = device
+
+    def run(self, model: nn.Module, show: bool) -> tuple[dict[str, float], float]:
+        """Recalls by metric name, and the score; collective, the same on every rank."""
+        from pipeline.evaluation.evaluate import evaluate
+
+        results = evaluate(model, self.sets, self.config, self.device)
+        values: dict[str, float] = {}
+        for result in results:
+            prefix = f"{result.set_name}.{result.protocol.name}"
+            values |= {f"{prefix}.recall_at_{k}": value for k, value in result.recalls.items()}
+            if show:
+                recalls = "  ".join(f"R@{k} {value:.1f}" for k, value in result.recalls.items())
+                print(f"validation  {result.set_name}  {result.protocol.name}  {recalls}", file=sys.stderr, flush=True)
+        return values, results[0].recalls[5]
