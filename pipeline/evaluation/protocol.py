@@ -83,7 +83,9 @@ class Protocol:
         interpolation = "antialiased" if self.resize == "antialias" else "resized after normalising, no antialias"
         pca = "no PCA"
         if self.pca:
-            pca = f"PCA {self.pca}{' whitened' if self.whiten else ''} fitted on {self.pca_source or 'its own database'}"
+            pca = (
+                f"PCA {self.pca}{' whitened' if self.whiten else ''} fitted on {self.pca_source or 'its own database'}"
+            )
         missing = "a miss" if self.without_positives == "miss" else "dropped"
         kept = self.precision if self.stored == self.precision else f"{self.precision}, stored {self.stored}"
         return (

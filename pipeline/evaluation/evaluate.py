@@ -1,0 +1,232 @@
+"""A model and some sets -> recalls with their protocols: the one evaluation that training, jobs and tables share.
+
+Invariant: collective and equal: every rank calls `evaluate` with the same sets and gets the same results; only rank 0
+searches and writes. A result never leaves without its protocol.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from pipeline.config import EvaluationConfig
+from pipeline.evaluation.descriptors import evaluating
+from pipeline.evaluation.engine import Engine, on_rank_0
+from pipeline.evaluation.evaluation_set import EvaluationSet
+from pipeline.evaluation.projection import Projection, fit_rows, projected, sample_rows
+from pipeline.evaluation.protocol import Protocol, Side, protocols
+from pipeline.evaluation.recall import recall_at
+from pipeline.evaluation.retrieval import (
+    Blocks,
+    agreement,
+    build_index,
+    index_bytes,
+    search,
+    search_index,
+    search_within,
+)
+
+SIDES: tuple[Side, Side] = ("database", "queries")
+
+
+@dataclass(frozen=True)
+class Result:
+    """The recall of one set under one protocol."""
+
+    set_name: str
+    protocol: Protocol
+    recalls: dict[int, float]
+    """Recall@N in percent; empty for a set without ground truth."""
+    queries: int
+    """Queries of the set, also those without positives."""
+    database: int
+    without_positives: int
+    """Queries that have no positive at all; a miss or dropped, as the protocol says."""
+    predictions: np.ndarray = field(repr=False)
+    """Database rows int64 [Q, max N], best first; -1 where the database is smaller."""
+    distances: np.ndarray = field(repr=False)
+    """Squared L2 of the predictions, float32 [Q, max N]."""
+    remarks: tuple[str, ...] = ()
+    """What a reader should know, for example how well an approximate search agrees with the exact one."""
+
+
+def evaluate(
+    model: nn.Module,
+    sets: Sequence[EvaluationSet],
+    config: EvaluationConfig,
+    device: torch.device | str,
+    output: Path | None = None,
+    progress: bool = True,
+    projections: Mapping[str, Projection] | None = None,
+    fingerprint: str | None = None,
+) -> list[Result]:
+    """Recall of `model` on every set under every grouping of `config`, sets outermost. Collective.
+
+    Args:
+        model: a `PlaceModel`, or the wrapper that holds one as `.module`; left in the mode it came in.
+        output: folder of the descriptor store (`config.store`) and of what is too large for memory.
+        progress: show bars on rank 0.
+        projections: protocol name without PCA -> PCA fitted before (`projection.fit_projections`); needed where
+            `config.pca_from` names a set; otherwise PCA is fitted on each set's own database.
+        fingerprint: identifies the weights in the store; None computes it from them when a store is wanted.
+
+    Raises:
+        DataError: images that cannot be read, descriptors that are not finite; the same on all ranks.
+    """
+    model = getattr(model, "module", model)
+    device = torch.device(device)
+    if config.store != "none" and output is not None and fingerprint is None:
+        fingerprint = model_fingerprint(model)
+    results: list[Result] = []
+    with evaluating(model), tempfile.TemporaryDirectory() as temporary:
+        engine = Engine(model, config, device, output, Path(temporary), progress, fingerprint or "")
+        for evaluated in sets:
+            chosen = protocols(config, engine.model.image_size, evaluated.rule)
+            sides = {side: engine.side(evaluated, side, chosen) for side in SIDES}
+            for protocol in chosen:
+                described = {side: sides[side].describe(protocol) for side in SIDES}
+                fitted = (projections or {}).get(protocol.grouping.name)
+                answer = on_rank_0(partial(answer_queries, evaluated, protocol, config, described, fitted))
+                results.append(score(evaluated, protocol, config, *answer))
+            for side in SIDES:
+                sides[side].close()
+    return results
+
+
+def model_fingerprint(model: nn.Module) -> str:
+    """Sixteen hex digits of the weights and buffers themselves, whatever file they came from."""
+    seen = hashlib.sha256()
+    for name, tensor in sorted(model.state_dict().items()):
+        seen.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        seen.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    return seen.hexdigest()[:16]
+
+
+def fit_projections(
+    model: nn.Module,
+    source: EvaluationSet,
+    config: EvaluationConfig,
+    device: torch.device | str,
+    progress: bool = True,
+) -> dict[str, Projection]:
+    """PCA of `source`'s database for every grouping: name of the grouping -> projection. Collective.
+
+    At most `projection.SAMPLE` images, seeded; groups are formed over the sample. Ranks other than 0 get {}.
+    """
+    model, device = getattr(model, "module", model), torch.device(device)
+    rows = sample_rows(len(source.database))
+    sampled = dataclasses.replace(
+        source,
+        database=[source.database[row] for row in rows],
+        queries=source.queries[:1],
+        positives=[np.zeros(0, np.int64)],
+        database_positions=None,
+        query_positions=None,
+        database_part=None,
+        query_part=None,
+    )
+    fitted: dict[str, Projection] = {}
+    with evaluating(model), tempfile.TemporaryDirectory() as temporary:
+        engine = Engine(model, config, device, None, Path(temporary), progress, "")
+        chosen = protocols(config, engine.model.image_size, source.rule)
+        side = engine.side(sampled, "database", chosen)
+        for protocol in chosen:
+            blocks = side.describe(protocol)
+
+            def fit(blocks: Blocks | None = blocks, protocol: Protocol = protocol) -> None:
+                about = (
+                    f"{source.name} database, {len(rows)} of {len(source.database)} images, {protocol.grouping.name}"
+                )
+                fitted[protocol.grouping.name] = fit_rows(
+                    _there(blocks), np.arange(len(rows)), config.pca or 0, protocol.whiten, about, device
+                )
+
+            on_rank_0(fit)
+        side.close()
+    return fitted
+
+
+def answer_queries(
+    evaluated: EvaluationSet,
+    protocol: Protocol,
+    config: EvaluationConfig,
+    described: Mapping[Side, Blocks | None],
+    fitted: Projection | None = None,
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """The search itself, on one process, from descriptors in memory or in a store.
+
+    Returns (database rows [Q, k], squared distances [Q, k], remarks). PCA is fitted on the set's own database where
+    the protocol asks for PCA and none is given.
+    """
+    database, queries = _there(described["database"]), _there(described["queries"])
+    if protocol.pca:
+        rows = sample_rows(len(evaluated.database))
+        about = f"{evaluated.name} database, {len(rows)} of {len(evaluated.database)} images, {protocol.grouping.name}"
+        fitted = fitted or fit_rows(database, rows, protocol.pca, protocol.whiten, about)
+        database, queries = projected(database, fitted), projected(queries, fitted)
+    asked = _in_order(queries, len(evaluated.queries))
+    k = max(config.recalls)
+    if evaluated.database_part is not None and evaluated.query_part is not None:
+        distances, rows = search_within(asked, evaluated.query_part, database, evaluated.database_part, k)
+        return rows, distances, ("each query is searched within its own part of the database",)
+    if protocol.search == "exact":
+        distances, rows = search(asked, database(), k)
+        return rows, distances, ()
+    index = build_index(database, protocol.search)
+    distances, rows = search_index(index, asked, k)
+    sample = sample_rows(len(asked), 1_000)  # the exact answer of some queries tells what the approximation costs
+    found = agreement(rows[sample], search(asked[sample], database(), k)[1])
+    remark = f"{protocol.search} finds {found:.1f} % of the exact {k} neighbours ({len(sample):,} queries), index"
+    return rows, distances, (f"{remark} {index_bytes(index) / 1e6:,.1f} MB",)
+
+
+def score(
+    evaluated: EvaluationSet,
+    protocol: Protocol,
+    config: EvaluationConfig,
+    predictions: np.ndarray,
+    distances: np.ndarray,
+    remarks: tuple[str, ...] = (),
+) -> Result:
+    """Predictions [Q, k] -> the result, without recalls where the set has no ground truth."""
+    recalls: dict[int, float] = {}
+    if getattr(evaluated, "has_ground_truth", True):
+        recalls = recall_at(
+            predictions, evaluated.positives, config.recalls, without_positives=config.without_positives
+        )
+    return Result(
+        evaluated.name,
+        protocol,
+        recalls,
+        len(evaluated.queries),
+        len(evaluated.database),
+        sum(len(positives) == 0 for positives in evaluated.positives),
+        predictions,
+        distances,
+        tuple(evaluated.remarks) + remarks,
+    )
+
+
+def _in_order(blocks: Blocks, rows: int) -> np.ndarray:
+    """All blocks as one array [rows, dim] in row order."""
+    whole: np.ndarray | None = None
+    for numbers, block in blocks():
+        if whole is None:
+            whole = np.empty((rows, block.shape[1]), block.dtype)
+        whole[numbers] = block
+    assert whole is not None  # an evaluation set has at least one query
+    return whole
+
+
+def _there(blocks: Blocks | None) -> Blocks:
+    assert blocks is not None  # descriptors are on rank 0, and only rank 0 searches
+    return blocks
