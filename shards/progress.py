@@ -70,8 +70,9 @@ class Progress:
     def _line(self, note: str) -> None:
         seconds = max(time.monotonic() - self._start, 1e-9)
         of = f"/{self.total:,}" if self.total is not None else ""
+        rate = (self.done - self._before) / seconds
         print(
-            f"{self.label}: {self.done:,}{of} {self.unit}, {(self.done - self._before) / seconds:,.1f} a second  {note}".rstrip(),
+            f"{self.label}: {self.done:,}{of} {self.unit}, {rate:,.1f} a second  {note}".rstrip(),
             file=sys.stderr,
             flush=True,
         )

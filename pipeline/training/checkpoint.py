@@ -15,15 +15,15 @@ import dataclasses
 import json
 import os
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from pipeline.config import RunConfig, flatten
-from shards.errors import DataError, Diverged, UsageError
+from shards.errors import DataError, UsageError
 
 # Settings a resumed run may change: they decide where, how long and how fast, never what a step computes.
 FREE = (
@@ -74,26 +74,26 @@ def folder(run: Path, step: int) -> Path:
 
 
 def write(
-    run: Path, state: RunState, config: RunConfig, model: dict[str, Tensor], optimizer: dict[str, Tensor]
+    run: Path, state: RunState, config: RunConfig, weights: Callable[[Path], None], optimizer: dict[str, Tensor]
 ) -> Path:
     """Writes one checkpoint and points `last` at it. Called on one rank, with whole tensors on the CPU.
 
-    Raises:
-        Diverged: a weight is not finite; nothing is written and the last good checkpoint stays.
+    Args:
+        run: the run's folder.
+        state, config: go into state.json.
+        weights: writes the model's file at a path.
+        optimizer: tensors named `<parameter>/<state>`.
     """
     from safetensors.torch import save_file
 
-    for name, tensor in model.items():
-        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
-            raise Diverged(f"weight {name} is not finite at step {state.step}; the last good checkpoint is kept")
     target = folder(run, state.step)
     temporary = target.with_name(f".writing-{target.name}-{os.getpid()}")
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
-    header = {"config": json.dumps(flatten(config)), "format": "pt"}
-    save_file({k: v.contiguous() for k, v in model.items()}, temporary / "model.safetensors", metadata=header)
+    weights(temporary / "model.safetensors")
     save_file({k: v.contiguous() for k, v in optimizer.items()}, temporary / "optimizer.safetensors")
-    (temporary / "state.json").write_text(json.dumps(dataclasses.asdict(state), indent=1) + "\n")
+    told = {"state": dataclasses.asdict(state), "config": flatten(config)}
+    (temporary / "state.json").write_text(json.dumps(told, indent=1) + "\n")
     for file in temporary.iterdir():
         sync(file)
     sync(temporary)
@@ -168,20 +168,18 @@ def find(run: Path, resume: str) -> Path | None:
     raise UsageError(f"{resume} holds no checkpoint (no state.json)")
 
 
-def read(path: Path) -> tuple[RunState, dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
-    """State, flat config, model tensors and optimiser tensors of a checkpoint.
+def read(path: Path) -> tuple[RunState, dict[str, Any], dict[str, Tensor]]:
+    """State, flat config and optimiser tensors of a checkpoint; its weights are read by `pipeline.model.weights`.
 
     Raises:
         DataError: a file is missing or not what it should be.
     """
-    from safetensors import SafetensorError, safe_open
+    from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     try:
-        state = RunState(**json.loads((path / "state.json").read_text()))
-        with safe_open(str(path / "model.safetensors"), framework="pt") as file:
-            config = json.loads(file.metadata()["config"])
-        return state, config, load_file(path / "model.safetensors"), load_file(path / "optimizer.safetensors")
+        told = json.loads((path / "state.json").read_text())
+        return RunState(**told["state"]), told["config"], load_file(path / "optimizer.safetensors")
     except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"checkpoint {path} cannot be read ({error}); remove it to resume from an older one") from error
 

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from pipeline.config import TrainConfig
 from pipeline.distributed import is_distributed, rank, world_size
+from pipeline.model.vpr import PlaceModel
 from shards.errors import UsageError
 
 BuildOptimizer = Callable[[Iterator[nn.Parameter]], torch.optim.Optimizer]
@@ -38,21 +39,21 @@ class Engine:
     def __init__(
         self,
         accelerator: Any,
-        model: nn.Module,
+        model: PlaceModel,
         build: BuildOptimizer,
         clip: float | None,
     ) -> None:
         self.accelerator, self.clip = accelerator, clip
         self._wrap(model, build)
 
-    def _wrap(self, model: nn.Module, build: BuildOptimizer) -> None:
+    def _wrap(self, model: PlaceModel, build: BuildOptimizer) -> None:
         optimizer = build(model.parameters())
         self.module, self.optimizer = self.accelerator.prepare(model, optimizer)
 
     @property
-    def model(self) -> nn.Module:
+    def model(self) -> PlaceModel:
         """The model inside the wrapper."""
-        inner: nn.Module = self.accelerator.unwrap_model(self.module, keep_torch_compile=False)
+        inner: PlaceModel = self.accelerator.unwrap_model(self.module, keep_torch_compile=False)
         return inner
 
     def names(self) -> dict[str, nn.Parameter]:
@@ -94,29 +95,19 @@ class Engine:
         )
         return model, self._collect(moments)
 
-    def load(self, model: dict[str, Tensor], optimizer: dict[str, Tensor]) -> None:
-        """Puts whole tensors, as `state` gave them, into model and optimiser."""
-        self._load_model(model)
+    def load(self, optimizer: dict[str, Tensor]) -> None:
+        """Puts whole optimiser tensors, as `state` gave them, where they belong. (The weights are loaded into the
+        model before it is wrapped.)"""
         inner = getattr(self.optimizer, "optimizer", self.optimizer)
         parameters = self.names()
         for key, value in optimizer.items():
             name, state = key.rsplit("/", 1)
             parameter = parameters[name]
             # the step counter stays on the CPU, where torch's own optimisers keep it
-            placed = value.clone() if value.ndim == 0 else _like(value, parameter)
-            inner.state[parameter][state] = placed
-
-    def _load_model(self, model: dict[str, Tensor]) -> None:
-        own = self.model.state_dict()
-        unknown = set(model) - set(own)
-        if unknown:
-            raise UsageError(f"the checkpoint holds {sorted(unknown)[0]}, which this model has not")
-        with torch.no_grad():
-            for name, value in model.items():
-                own[name].copy_(_like(value, own[name]))
+            inner.state[parameter][state] = value.clone() if value.ndim == 0 else _like(value, parameter)
 
     @contextmanager
-    def plain(self) -> Iterator[nn.Module]:
+    def plain(self) -> Iterator[PlaceModel]:
         """The whole model, unwrapped, in evaluation mode, usable on each rank alone; then training mode again."""
         model = self.model
         model.eval()
@@ -145,7 +136,7 @@ class ShardedEngine(Engine):
 
     name = "fsdp2"
 
-    def _wrap(self, model: nn.Module, build: BuildOptimizer) -> None:
+    def _wrap(self, model: PlaceModel, build: BuildOptimizer) -> None:
         from torch.distributed.device_mesh import init_device_mesh
         from torch.distributed.fsdp import MixedPrecisionPolicy, fully_shard
 
@@ -166,11 +157,12 @@ class ShardedEngine(Engine):
         self.optimizer = build(model.parameters())
 
     @property
-    def model(self) -> nn.Module:
-        return self.module
+    def model(self) -> PlaceModel:
+        sharded: PlaceModel = self.module
+        return sharded
 
     @contextmanager
-    def plain(self) -> Iterator[nn.Module]:
+    def plain(self) -> Iterator[PlaceModel]:
         # a sharded model cannot be called a different number of times on each rank, as evaluation does
         sharded = self.module.state_dict()
         self._template.to(self.accelerator.device)
@@ -220,7 +212,7 @@ def choose(setting: str) -> str:
 
 
 def build_engine(
-    config: TrainConfig, accelerator: Any, model: nn.Module, build: BuildOptimizer, micro_batch: int
+    config: TrainConfig, accelerator: Any, model: PlaceModel, build: BuildOptimizer, micro_batch: int
 ) -> Engine:
     """The engine for this launch; `micro_batch` is b, images on this rank (DeepSpeed wants it said).
 

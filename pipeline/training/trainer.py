@@ -9,18 +9,21 @@ repeats no place and skips none.
 from __future__ import annotations
 
 import json
-import time
-from dataclasses import asdict, dataclass
+import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from pipeline.config import RunConfig, to_dict
 from pipeline.data.images import normalise
 from pipeline.data.places import Batch, build_loader
 from pipeline.data.plan import plan
 from pipeline.distributed import any_rank, barrier, broadcast_object, rank, world_size
+from pipeline.model.vpr import PlaceModel, build_model
+from pipeline.model.weights import frozen_hash, load_trainable, save_model
 from pipeline.training import checkpoint
 from pipeline.training.checkpoint import RunState
 from pipeline.training.engine import Engine, build_engine
@@ -30,7 +33,7 @@ from pipeline.training.meter import Meter
 from pipeline.training.schedule import build_optimizer, learning_rate
 from pipeline.training.tracking import Tracker
 from pipeline.training.validation import Validation
-from shards.errors import DataError, Diverged, Preempted, UsageError
+from shards.errors import DataError, Diverged, Preempted, UsageError, UserError
 from shards.index import read_index
 
 
@@ -61,8 +64,6 @@ class Trainer:
     """
 
     def __init__(self, config: RunConfig, accelerator: Any) -> None:
-        from pipeline.model.vpr import build_model
-
         self.config, self.accelerator = config, accelerator
         self.main = rank() == 0
         self.run = Path(config.output) / config.name
@@ -75,7 +76,8 @@ class Trainer:
 
         torch.manual_seed(config.seed)
         model = build_model(config.model, config.data.image_size)
-        self.state, saved = self._resume()
+        self.backbone_hash = frozen_hash(model)
+        self.state, optimizer = self._resume(model)
         self.engine: Engine = build_engine(
             config.train,
             accelerator,
@@ -83,8 +85,7 @@ class Trainer:
             lambda parameters: build_optimizer(config.train, parameters),
             4 * config.data.places_per_batch // world_size(),
         )
-        if saved is not None:
-            self.engine.load(*saved)
+        self.engine.load(optimizer)
         self.loss = MultiSimilarityLoss(
             alpha=config.loss.alpha, beta=config.loss.beta, base=config.loss.base, margin=config.loss.margin
         )
@@ -150,10 +151,10 @@ class Trainer:
             descriptors = self.engine(images, chunk=config.train.encode_chunk)
         loss = self.loss(descriptors, labels)
         value = loss.detach().item()  # the global batch's loss, the same on every rank
-        if not torch.isfinite(torch.tensor(value)):
+        if not math.isfinite(value):
             raise Diverged(
-                f"the loss is {value} at step {state.step} (epoch {state.epoch}); the last good checkpoint is "
-                f"{self.run / 'checkpoints' / 'last'}; try a smaller --train.lr, --train.clip 1.0 or --train.warmup_steps"
+                f"the loss is {value} at step {state.step} (epoch {state.epoch}); the last good checkpoint of "
+                f"{self.run} stays; try a smaller --train.lr, --train.clip 1.0 or --train.warmup_steps 500"
             )
         rate = learning_rate(config.train, state.step, self.steps_per_epoch, self.total_steps)
         self.engine.step(loss, rate)
@@ -196,35 +197,53 @@ class Trainer:
             self.state.stale += 1
 
     def _save(self) -> None:
-        """One checkpoint (collective)."""
-        state = self.state
-        state.world_size = world_size()
-        model, optimizer = self.engine.state()
-        problem = None
+        """One checkpoint (collective): whole tensors are gathered on rank 0, which writes."""
+        self.state.world_size = world_size()
+        tensors, optimizer = self.engine.state()
+        problem: UserError | None = None
         if self.main:
             try:
-                path = checkpoint.write(self.run, state, self.config, self.engine.model, model, optimizer)
-                if state.best_step == state.step or self.validation is None:
-                    checkpoint.point(self.run, "best", path)
-                    self.tracker.checkpoint(path.resolve(), state.step, state.validated)
-                checkpoint.prune(self.run, self.config.train.keep)
-            except (OSError, Diverged) as error:
+                self._write(tensors, optimizer)
+            except OSError as error:
+                problem = DataError(f"cannot write a checkpoint under {self.run}: {error}")
+            except Diverged as error:
                 problem = error
         problem = broadcast_object(problem)
-        if isinstance(problem, OSError):
-            raise DataError(f"cannot write a checkpoint under {self.run}: {problem}")
         if problem is not None:
             raise problem
 
-    def _resume(self) -> tuple[RunState, Any]:
+    def _write(self, tensors: dict[str, Tensor], optimizer: dict[str, Tensor]) -> None:
+        state, config = self.state, self.config
+        for name, tensor in tensors.items():
+            if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+                raise Diverged(
+                    f"{name} is not finite at step {state.step}; the last good checkpoint of {self.run} stays"
+                )
+
+        def weights(path: Path) -> None:
+            save_model(
+                self.engine.model, path, config.model, config.data.image_size, everything=False,
+                extra={"run": config.name, "step": state.step, "mlflow_run_id": state.run_id},
+                state=tensors, backbone_hash=self.backbone_hash,
+            )  # fmt: skip
+
+        path = checkpoint.write(self.run, state, config, weights, optimizer)
+        if state.best_step == state.step or self.validation is None:
+            checkpoint.point(self.run, "best", path)
+            self.tracker.checkpoint(path.resolve(), state.step, state.validated)
+        checkpoint.prune(self.run, config.train.keep)
+
+    def _resume(self, model: PlaceModel) -> tuple[RunState, dict[str, Tensor]]:
+        """Where to continue, the weights put into the model; or a new run's state."""
         path = checkpoint.find(self.run, self.config.train.resume)
         if path is None:
-            return RunState(index=self.index.digest), None
-        state, config, model, optimizer = checkpoint.read(path)
+            return RunState(index=self.index.digest), {}
+        state, config, optimizer = checkpoint.read(path)
         checkpoint.check_same(config, self.config, state, self.index.digest)
+        load_trainable(model, path)
         if path.parent.parent != self.run.resolve():
             state.run_id = ""  # branched off another run: a run of its own in MLflow
-        return state, (model, optimizer)
+        return state, optimizer
 
     def _open(self) -> None:
         """The run's folder, its MLflow run and the sample log."""
@@ -286,8 +305,3 @@ def check_batch(config: RunConfig, steps_per_epoch: int) -> None:
         )
     if steps_per_epoch == 0:
         raise UsageError(f"the shards hold fewer than data.places_per_batch = {places} places; make the batch smaller")
-
-
-def summary(config: RunConfig, state: RunState) -> dict[str, Any]:
-    """What a finished run tells: its state and where it is recorded."""
-    return {"run": config.name, **asdict(state)}

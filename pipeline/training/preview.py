@@ -1,0 +1,101 @@
+"""What a run would be, before it starts: batches, steps, parameters, memory, disk (`jobs.train --dry-run`).
+
+Invariant: nothing is written. Counts are exact; activation memory is measured on one small batch of the real model
+(bytes that autograd keeps for backward) and scaled to the run's batch, so it is an estimate and is called one.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from pipeline.config import RunConfig
+from pipeline.data.plan import plan
+from pipeline.distributed import world_size
+from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
+from shards.index import ShardIndex, read_index
+
+# whole copies of the trainable parameters that the optimiser keeps
+MOMENTS = {"adam": 2, "adamw": 2, "sgd": 0}
+
+
+def saved_bytes(model: PlaceModel, images: int) -> int:
+    """Bytes autograd keeps for the backward of `images` images through encode and correlate, parameters left out."""
+    parameters = {p.untyped_storage().data_ptr() for p in model.parameters()}
+    seen: dict[int, int] = {}
+
+    def pack(tensor: torch.Tensor) -> torch.Tensor:
+        storage = tensor.untyped_storage()
+        if storage.data_ptr() not in parameters:
+            seen[storage.data_ptr()] = storage.nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+        keep = model(torch.zeros(images, 3, model.image_size, model.image_size))
+    del keep
+    return sum(seen.values())
+
+
+def preview(config: RunConfig) -> list[tuple[str, str]]:
+    """Rows (what, value) of the plan of a run.
+
+    Raises:
+        UsageError, DataError: whatever would stop the run at its start.
+    """
+    index = read_index(config.data.shards)
+    rows = _plan_rows(config, index)
+    torch.manual_seed(config.seed)
+    model = build_model(config.model, config.data.image_size)
+    counts = parameter_counts(model)
+    rows += [
+        ("descriptor", f"{model.regions} regions x {model.backbone.dim} = {model.descriptor_dim} dimensions"),
+        ("parameters", f"{counts['total']:,}: {counts['trainable']:,} trained, "
+                       f"{counts['total'] - counts['trainable']:,} frozen"),
+    ]  # fmt: skip
+    return rows + _size_rows(config, model, counts)
+
+
+def _plan_rows(config: RunConfig, index: ShardIndex) -> list[tuple[str, str]]:
+    data, w = config.data, world_size()
+    first = plan(index, config.seed, 0, data.places_per_batch, data.order, data.window_shards)
+    steps = len(first.batches)
+    images = 4 * data.places_per_batch
+    total = steps * config.train.epochs
+    limited = min(total, config.train.steps) if config.train.steps is not None else total
+    rounds = int(index.table.column("round").to_numpy().max()) + 1
+    places = int(index.table.column("place").to_numpy().max()) + 1
+    return [
+        ("shards", f"{data.shards}: {places:,} places, {rounds} rounds of four images"),
+        ("global batch", f"{data.places_per_batch} places x 4 = {images} images, order {data.order}"),
+        ("processes", f"{w}, {images // w} images each"),
+        ("epoch", f"{steps:,} steps; {first.left_over:,} places wait for another epoch"),
+        ("run", f"{limited:,} steps in {config.train.epochs} epochs, {limited * images:,} images"),
+    ]
+
+
+def _size_rows(config: RunConfig, model: PlaceModel, counts: dict[str, int]) -> list[tuple[str, str]]:
+    trained, w = counts["trainable"], world_size()
+    model.train()
+    one, three = saved_bytes(model, 4), saved_bytes(model, 8)
+    each = max(0, three - one) / 4
+    b = 4 * config.data.places_per_batch // w
+    at_once = min(b, config.train.encode_chunk or b)
+    fixed = counts["total"] * 4 + trained * 4 * (1 + MOMENTS[config.train.optimizer])
+    descriptors = 4 * config.data.places_per_batch * model.descriptor_dim * 4 * 3
+    stored = trained * 4 * (1 + MOMENTS[config.train.optimizer])
+    if config.model.backbone.weights is None:
+        stored += (counts["total"] - trained) * 4
+    return [
+        ("memory a process", f"{_gb(fixed)} weights, gradients, moments + about {_gb(at_once * each + descriptors)} "
+                             f"activations ({at_once} images at once, float32) = {_gb(fixed + at_once * each + descriptors)}"),
+        ("checkpoint", f"{_gb(stored)} each, at most {config.train.keep + 1} kept"),
+    ]  # fmt: skip
+
+
+def _gb(n: float) -> str:
+    return f"{n / 1e9:.2f} GB" if n >= 1e8 else f"{n / 1e6:.1f} MB"
+
+
+def show(rows: list[tuple[str, str]]) -> str:
+    """The rows as an aligned text table."""
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"  {name:<{width}}  {value}" for name, value in rows)
