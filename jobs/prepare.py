@@ -1,0 +1,101 @@
+"""Photos on disk -> tar shards with their index.
+
+    python -m jobs.prepare --source DIR --out DIR --rounds 4
+    python -m jobs.prepare --verify DIR
+
+Killed, it continues; done, it says so. Exit codes: 0 done, 2 usage, 3 too many bad images, or a set that is not as its
+manifest says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from jobs.cli import parse, run_job
+from shards.errors import DataError, UsageError
+
+
+@dataclass(frozen=True)
+class PrepareConfig:
+    """What to prepare, or to verify."""
+
+    source: str | None = None
+    """Folder of GSV-Cities (Images/ and Dataframes/), or of one's own places."""
+    out: str | None = None
+    """Folder of the shard set; new, empty, or of the same set begun earlier."""
+    rounds: int = 4
+    """Rounds R, each with four images of every place; epoch e reads round e mod R. ceil(n/4) rounds show n images."""
+    seed: int = 0
+    """Decides which images a round shows and the order of places."""
+    max_bad: float = 0.01
+    """Share of the named images that may be missing or broken before the run ends with code 3."""
+    shard_mb: float = 64.0
+    """Size of a shard file in MB, about; smaller where a round would have under 16 of them."""
+    resize: int = 0
+    """Reduce larger photos to this shorter side in pixels (JPEG quality 95); 0 copies the bytes."""
+    check: Literal["decode", "header", "none"] = "decode"
+    """How each JPEG is checked: decoded to its end, header and end marker only, or not at all."""
+    kind: Literal["auto", "gsv_cities", "folders", "utm"] = "auto"
+    """Layout of the source: found by itself, GSV-Cities, one folder a place, or @utm names put into cells."""
+    cities: tuple[str, ...] = ()
+    """gsv_cities: city_ids to keep, for example '[PRS,Osaka]'; none keeps all."""
+    cell_m: float = 10.0
+    """utm: side of a place's cell in metres."""
+    heading_deg: float = 30.0
+    """utm: width of a place's heading sector in degrees; 0 puts all headings together."""
+    workers: int = 0
+    """Processes; 0 is one a core. The bytes do not depend on it."""
+    overwrite: bool = False
+    """Delete the shard set in --out first."""
+    verify: str | None = None
+    """Check every byte of a shard set (folder or fsspec URL) instead; code 3 when anything is off."""
+
+
+def main() -> None:
+    """Runs the job."""
+    config = parse(PrepareConfig, (__doc__ or "").split("\n\n    ")[0])
+    if config.verify is not None:
+        verify(config.verify)
+    elif config.source is None or config.out is None:
+        raise UsageError("give --source DIR and --out DIR, or --verify DIR")
+    else:
+        prepare(config, Path(config.source), Path(config.out))
+
+
+def verify(root: str) -> None:
+    """Prints what is wrong with a shard set and raises DataError, or says that all is well."""
+    from shards import index
+
+    problems = index.verify(root)
+    for problem in problems:
+        print(f"{root}: {problem}")
+    if problems:
+        raise DataError(f"{root}: {len(problems)} problem{'s' * (len(problems) > 1)}; do not train on this set")
+    counts = index.read_index(root).manifest["counts"]
+    print(f"{root}: all well, {counts['shards']:,} shards, {counts['bytes']:,} bytes, {counts['places']:,} places")
+
+
+def prepare(config: PrepareConfig, source: Path, out: Path) -> None:
+    """Reads the source, writes the shard set, prints the summary."""
+    from shards.images import ImageRule
+    from shards.sources import SourceRule, read_source, reading_settings
+    from shards.writer import WriteRule, remove_shards, write_shards
+
+    reading = SourceRule(config.kind, tuple(config.cities), config.cell_m, config.heading_deg)
+    catalogue = read_source(source, reading)
+    if config.overwrite:
+        remove_shards(out)
+    image = ImageRule(config.check, config.resize)
+    rule = WriteRule(
+        config.rounds, config.seed, config.shard_mb, image, reading_settings(catalogue.kind, reading),
+        config.max_bad, config.workers,
+    )  # fmt: skip
+    summary = write_shards(catalogue, out, rule)
+    print(f"{out}: {'complete' if summary.seconds else 'nothing to do, complete already'} ({catalogue.kind})")
+    print(summary)
+
+
+if __name__ == "__main__":
+    run_job(main)

@@ -1,0 +1,81 @@
+"""What a person is told at the end: a table of counts, and a file that names all that was left out, and why.
+
+Invariant: images named = used + unused + bad, and places named = in the set + under four + fallen under four; nothing
+disappears between the lines.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from shards.catalogue import LeftOut
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The outcome of writing a shard set: the manifest's counts, and this run's time (0 where nothing was to do)."""
+
+    root: str
+    counts: Mapping[str, int]
+    reasons: Mapping[str, int]
+    seconds: float
+    images_opened: int
+
+    def __str__(self) -> str:
+        c = self.counts
+        lines = [
+            ("places", f"{c['places']:,}", f"of {c['places_named']:,} named"),
+            ("  under four images", f"{c['places_under_four']:,}", "left out, named in report.csv"),
+            ("  fallen under four", f"{c['places_fallen']:,}", "by missing or broken images"),
+            ("rounds", f"{c['rounds']:,}", f"{c['samples']:,} samples of four images"),
+            ("images", f"{c['images_named']:,}", f"and {c['duplicates']:,} rows that name one again"),
+            ("  used", f"{c['images_used']:,}", f"{_percent(c['images_used'], c['images_named'])} %"),
+            ("  unused", f"{c['images_unused']:,}", "in no round, or of a place under four"),
+            ("  bad", f"{c['images_bad']:,}", "; ".join(f"{n:,} {reason}" for reason, n in self.reasons.items())),
+            ("files no row names", f"{c['unlisted']:,}", "" if c["unlisted"] == 0 else "not read"),
+            ("shards", f"{c['shards']:,}", f"{_bytes(c['bytes'])}"),
+        ]
+        if c["made_again"]:
+            lines.append(("JPEGs made again", f"{c['made_again']:,}", "resized or converted, quality 95"))
+        if self.seconds:
+            speed = f"{self.images_opened / self.seconds:,.0f} images/s" if self.images_opened else ""
+            lines.append(("seconds", f"{self.seconds:,.1f}", speed))
+        left = max(len(name) for name, _, _ in lines)
+        middle = max(len(value) for _, value, _ in lines)
+        return "\n".join(f"{name:<{left}}  {value:>{middle}}  {note}".rstrip() for name, value, note in lines)
+
+
+def report_bytes(left_out: Iterable[LeftOut]) -> bytes:
+    """report.csv: file, city, place, reason; a line with an empty file is about a whole place."""
+    sink = io.StringIO(newline="")
+    writer = csv.writer(sink, lineterminator="\n")
+    writer.writerow(LeftOut._fields)
+    writer.writerows(sorted(left_out))
+    return sink.getvalue().encode()
+
+
+def reasons(left_out: Iterable[LeftOut]) -> dict[str, int]:
+    """How many images each reason left out, the commonest first; decoders' details are put together."""
+    return dict(Counter(item.reason.split(":")[0] for item in left_out).most_common())
+
+
+def place_lines(under_four: Iterable[Mapping[str, Any]], fallen: Iterable[tuple[str, str, int, int]]) -> list[LeftOut]:
+    """The report's lines about places: those named with too few images, and those that lost too many."""
+    lines = [LeftOut("", p["city"], p["place_id"], f"only {p['images']} images are named") for p in under_four]
+    return lines + [LeftOut("", city, place, f"only {n} of {of} images are good") for city, place, n, of in fallen]
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{100 * part / max(whole, 1):.1f}"
+
+
+def _bytes(n: int) -> str:
+    for unit, size in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
+        if n >= size:
+            return f"{n / size:,.2f} {unit}"
+    return f"{n} bytes"
