@@ -1,4 +1,4 @@
-"""Train one run, or continue it: `accelerate launch [--config_file jobs/accelerate/ddp.yaml] -m jobs.train --config FILE`.
+"""Train one run, or continue it: accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.train --config FILE
 
 Also runs without the launcher, in one process: `python -m jobs.train --config FILE --data.places_per_batch 16`.
 The same command continues a run that was killed. `--dry-run` prints the plan and exits. Exit codes: `shards.errors`;

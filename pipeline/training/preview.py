@@ -84,11 +84,12 @@ def _size_rows(config: RunConfig, model: PlaceModel, counts: dict[str, int]) -> 
     stored = trained * 4 * (1 + MOMENTS[config.train.optimizer])
     if config.model.backbone.weights is None:
         stored += (counts["total"] - trained) * 4
-    return [
-        ("memory a process", f"{_gb(fixed)} weights, gradients, moments + about {_gb(at_once * each + descriptors)} "
-                             f"activations ({at_once} images at once, float32) = {_gb(fixed + at_once * each + descriptors)}"),
-        ("checkpoint", f"{_gb(stored)} each, at most {config.train.keep + 1} kept"),
-    ]  # fmt: skip
+    activations = at_once * each + descriptors
+    memory = (
+        f"{_gb(fixed)} weights, gradients, moments + about {_gb(activations)} activations "
+        f"({at_once} images at once, float32) = {_gb(fixed + activations)}"
+    )
+    return [("memory a process", memory), ("checkpoint", f"{_gb(stored)} each, at most {config.train.keep + 1} kept")]
 
 
 def _gb(n: float) -> str:
