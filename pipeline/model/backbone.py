@@ -9,7 +9,6 @@ that parameter counts are those of the released model.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pipeline.config import BackboneConfig
-from pipeline.model.adapters import AdaptedMLP
+from pipeline.config import BackboneConfig, ModelConfig
+from pipeline.model.adapters import AdaptedMLP, build_adapter
 from shards.errors import UsageError
 
 
@@ -69,8 +68,7 @@ def resize_positions(stored: Tensor, grid: int) -> Tensor:
     precise = torch.float64 if stored.dtype == torch.float64 and stored.requires_grad else torch.float32
     patches = stored[:, 1:].to(precise).reshape(1, side, side, -1).permute(0, 3, 1, 2)
     scale = (grid + 0.1) / side
-    with torch.autocast(stored.device.type, enabled=False):
-        patches = F.interpolate(patches, scale_factor=(scale, scale), mode="bicubic", align_corners=False)
+    patches = F.interpolate(patches, scale_factor=(scale, scale), mode="bicubic", align_corners=False)
     patches = patches.permute(0, 2, 3, 1).flatten(1, 2).to(stored.dtype)
     return torch.cat((stored[:, :1], patches), dim=1)
 
@@ -107,39 +105,48 @@ class Backbone(nn.Module):
     """DINOv2 with adapters: [b, 3, S, S] normalised images -> [b, 1 + G*G, D] tokens after the final LayerNorm.
 
     Args:
-        config: name or sizes, weights, attention implementation.
+        config: the model's config; used are its backbone, its adapter, and what of them is trained.
         image_size: side of the input in pixels, a multiple of the patch.
-        make_adapter: builds one block's adapter from the width D, or None for no adapters.
-        scale: the factor s on the adapter (paper, Eq. 4).
 
     Raises:
         UsageError: an input size that is no multiple of the patch, weights that do not fit, an attention
-            implementation that is not installed.
+            implementation that is not installed, more last blocks than there are.
     """
 
-    def __init__(
-        self,
-        config: BackboneConfig,
-        image_size: int,
-        make_adapter: Callable[[int], nn.Module] | None,
-        scale: float,
-    ) -> None:
+    def __init__(self, config: ModelConfig, image_size: int) -> None:
         super().__init__()
-        size = sizes(config)
+        size = sizes(config.backbone)
         if image_size % size.patch or image_size < size.patch:
             raise UsageError(f"data.image_size {image_size} is not a multiple of the backbone's patch {size.patch}")
+        if config.train == "last" and not 1 <= config.last_blocks <= size.depth:
+            raise UsageError(f"model.last_blocks {config.last_blocks} must lie between 1 and the depth {size.depth}")
         self.dim, self.depth, self.grid = size.dim, size.depth, image_size // size.patch
+        weights = config.backbone.weights
         # with released weights the random start would only cost time: shapes first, tensors from the file
-        with torch.device("meta") if config.weights else contextlib.nullcontext():
-            self.vit: Any = _library_model(size, config)
+        with torch.device("meta") if weights else contextlib.nullcontext():
+            self.vit: Any = _library_model(size, config.backbone)
             self.vit.embeddings = Embeddings(self.vit.embeddings, self.grid)
-        if config.weights:
+        if weights:
             from pipeline.model.pretrained import load_backbone
 
-            load_backbone(self, config.weights, config.name)
-        if make_adapter is not None:
-            for block in self.blocks:
-                block.mlp = AdaptedMLP(block.mlp, make_adapter(size.dim), scale)
+            load_backbone(self, weights, config.backbone.name)
+        self._freeze(config)
+
+    def _freeze(self, config: ModelConfig) -> None:
+        """Sets what is trained, and adapters in where they are.
+
+        A frozen adapter would add nothing for ever, its last Linear being zero, so frozen blocks get none. The mask
+        token is never trained: it takes part in nothing, and DDP wants no idle trainable parameter.
+        """
+        last = {"adapters": self.depth, "full": self.depth, "frozen": 0, "last": config.last_blocks}[config.train]
+        self.requires_grad_(config.train == "full")
+        self.vit.embeddings.mask_token.requires_grad_(False)
+        if config.train == "last":
+            for module in (*self.blocks[self.depth - last :], self.vit.layernorm):
+                module.requires_grad_(True)
+        if config.adapter.kind != "none":
+            for block in self.blocks[self.depth - last :]:
+                block.mlp = AdaptedMLP(block.mlp, build_adapter(config.adapter, self.dim), config.adapter.scale)
 
     @property
     def blocks(self) -> list[Any]:
@@ -150,20 +157,6 @@ class Backbone(nn.Module):
         """The adapters in block order; empty without adapters."""
         return [block.mlp.adapter for block in self.blocks if isinstance(block.mlp, AdaptedMLP)]
 
-    def freeze(self, train: str, last_blocks: int) -> None:
-        """Sets what is trained: "adapters", "full", "frozen" or "last" (the last blocks with their adapters and the
-        final norm). The mask token never is: it takes part in nothing, and DDP wants no idle trainable parameter."""
-        self.requires_grad_(train == "full")
-        if train == "adapters":
-            for adapter in self.adapters():
-                adapter.requires_grad_(True)
-        elif train == "last":
-            if not 1 <= last_blocks <= self.depth:
-                raise UsageError(f"model.last_blocks {last_blocks} must lie between 1 and the depth {self.depth}")
-            for block in (*self.blocks[-last_blocks:], self.vit.layernorm):
-                block.requires_grad_(True)
-        self.vit.embeddings.mask_token.requires_grad_(False)
-
     def forward(self, images: Tensor) -> Tensor:
         """[b, 3, S, S] -> [b, 1 + G*G, D]: class token first, then patches row by row."""
         tokens: Tensor = self.vit(pixel_values=images).last_hidden_state
@@ -173,17 +166,17 @@ class Backbone(nn.Module):
 def _library_model(size: Sizes, config: BackboneConfig) -> Any:
     from transformers import Dinov2Config, Dinov2Model  # four seconds: only where a model is built
 
-    settings: dict[str, Any] = dict(
-        hidden_size=size.dim,
-        num_hidden_layers=size.depth,
-        num_attention_heads=size.heads,
-        mlp_ratio=size.mlp_ratio,
-        image_size=size.pretrain_grid * size.patch,
-        patch_size=size.patch,
-        use_swiglu_ffn=size.swiglu,
-        layerscale_value=config.layerscale,
-        attn_implementation=config.attention,
-    )
+    settings: dict[str, Any] = {
+        "hidden_size": size.dim,
+        "num_hidden_layers": size.depth,
+        "num_attention_heads": size.heads,
+        "mlp_ratio": size.mlp_ratio,
+        "image_size": size.pretrain_grid * size.patch,
+        "patch_size": size.patch,
+        "use_swiglu_ffn": size.swiglu,
+        "layerscale_value": config.layerscale,
+        "attn_implementation": config.attention,
+    }
     try:
         return Dinov2Model(Dinov2Config(**settings))
     except (ImportError, ValueError) as error:

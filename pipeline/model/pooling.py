@@ -27,7 +27,7 @@ def cell_members(grid: int, levels: tuple[int, ...]) -> Tensor:
     for n in levels:
         spans = list(itertools.pairwise(cell_edges(grid, n)))
         for (top, bottom), (left, right) in itertools.product(spans, spans):
-            cell = torch.zeros(grid, grid)
+            cell = torch.zeros(grid, grid, device="cpu")  # also where the model is only shapes so far
             cell[top:bottom, left:right] = 1.0
             rows.append(cell.flatten())
     return torch.stack(rows)
@@ -64,7 +64,7 @@ class Pooling(nn.Module):
             levels = levels[:first] + levels[first + 1 :]
         self.regions = sum(n * n for n in levels) + (self.class_at is not None)
         self.p = nn.Parameter(torch.full((1,), float(config.p))) if levels else None
-        members = cell_members(grid, levels) if levels else torch.zeros(0, grid * grid)
+        members = cell_members(grid, levels) if levels else torch.zeros(0, grid * grid, device="cpu")
         self.register_buffer("members", members, persistent=False)  # follows from the config, so it is never stored
 
     def forward(self, tokens: Tensor) -> Tensor:

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from pipeline.config import ModelConfig
-from pipeline.model.adapters import build_adapter
 from pipeline.model.backbone import Backbone
 from pipeline.model.batch_norm import GlobalBatchNorm2d
 from pipeline.model.cross_image import CrossImageEncoder
@@ -34,10 +33,7 @@ class PlaceModel(nn.Module):
         super().__init__()
         self.config = config
         self.image_size = image_size
-        adapter = config.adapter
-        make = (lambda dim: build_adapter(adapter, dim)) if adapter.kind != "none" else None
-        self.backbone = Backbone(config.backbone, image_size, make, adapter.scale)
-        self.backbone.freeze(config.train, config.last_blocks)
+        self.backbone = Backbone(config, image_size)
         self.pooling = Pooling(config.pooling, self.backbone.grid)
         self.cross_image = CrossImageEncoder(self.backbone.dim, config.cross_image)
         self.regions = self.pooling.regions
