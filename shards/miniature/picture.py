@@ -1,0 +1,125 @@
+"""A photo of a place: sky, skyline, ground, houses, things and passers-by, then the camera's own faults.
+
+Invariant: what stays the same over the photos of a `Studio` is the place; everything else comes from the photo's seed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from shards.miniature import facade
+from shards.miniature.camera import Array, Camera, Surface, lay
+from shards.miniature.layout import Photo
+from shards.miniature.lens import develop
+from shards.miniature.painter import Wall
+from shards.miniature.place import Building, make_place
+from shards.miniature.roof import cover, slopes
+from shards.miniature.scenery import Scenery
+from shards.miniature.weather import Conditions
+
+OVERSAMPLE = 1.5
+Step = tuple[float, Callable[[], None]]
+
+
+class Studio:
+    """One place with its facades drawn, ready to be photographed.
+
+    Args:
+        town: number of the town; seed: of the place's identity.
+    """
+
+    def __init__(self, town: int, seed: tuple[int, ...]) -> None:
+        self.place = make_place(town, seed)
+        self._walls: dict[tuple[int, bool], Wall] = {}
+
+    def photograph(self, photo: Photo, size: tuple[int, int]) -> bytes:
+        """The photo as JPEG bytes, `size` = (width, height) pixels."""
+        rng = np.random.default_rng([*photo.seed, 3])
+        width, height = int(size[0] * OVERSAMPLE), int(size[1] * OVERSAMPLE)
+        horizon = height * float(rng.uniform(0.60, 0.70))
+        camera = Camera(
+            photo.x, photo.y, photo.z, self.place.view + photo.yaw, photo.zoom * width, horizon,
+            float(rng.normal(0, 0.008)), width, height,
+        )  # fmt: skip
+        canvas = Image.new("RGB", (width, height))
+        scene = Scenery(canvas, camera, self.place, photo.conditions, rng)
+        scene.sky()
+        scene.skyline()
+        scene.ground()
+        steps: list[Step] = scene.things() + scene.traffic()
+        for building in self.place.buildings:
+            x = min(max(camera.x, building.x0), building.x1)
+            z = min(max(camera.z, building.z0), building.z1)
+            if max(camera.depth(a, b) for a in (building.x0, building.x1) for b in (building.z0, building.z1)) > 1:
+                distance = math.hypot(x - camera.x, z - camera.z)
+                steps.append((distance + 0.5, lambda b=building, d=distance: self._build(canvas, camera, photo, b, d)))  # type: ignore[misc]
+        for _, step in sorted(steps, key=lambda item: -item[0]):
+            step()
+        scene.air()
+        return develop(canvas, size, photo.conditions, rng)
+
+    def _wall(self, number: int, building: Building, full: bool, width: float) -> Wall:
+        key = (building.seed * 4 + number, full)
+        if key not in self._walls:
+            self._walls[key] = facade.front(building) if full else facade.side(building, width)
+        return self._walls[key]
+
+    def _build(self, canvas: Image.Image, camera: Camera, photo: Photo, b: Building, distance: float) -> None:
+        """Draws the visible faces and the roof of a house."""
+        wide, deep, up = b.x1 - b.x0, b.z1 - b.z0, b.height
+        faces = {
+            "south": Surface((b.x0, up, b.z0), (wide, 0, 0), (0, -up, 0)),
+            "east": Surface((b.x1, up, b.z0), (0, 0, deep), (0, -up, 0)),
+            "west": Surface((b.x0, up, b.z1), (0, 0, -deep), (0, -up, 0)),
+        }
+        for surface in slopes(b):
+            if surface.faces(camera):
+                self._roof(canvas, camera, photo.conditions, b, surface, distance)
+        for number, (name, plane) in enumerate(faces.items()):
+            if not plane.faces(camera) or not camera.polygon(plane.corners):
+                continue
+            full = name in b.fronts
+            wall = self._wall(number, b, full, wide if name == "south" else deep)
+            if wall.height > up:  # the gable rises above the eaves
+                extra = wall.height - up
+                x, y, z = plane.corner
+                plane = Surface((x, y + extra, z), plane.right, (0, -up - extra, 0))
+            picture = self._lit(wall, plane.normal, photo, distance, b)
+            lay(canvas, camera, plane, picture, wall.alpha)
+
+    def _lit(self, wall: Wall, normal: Array, photo: Photo, distance: float, b: Building) -> Image.Image:
+        """The wall's picture in the photo's light, with snow and lit windows."""
+        sky = photo.conditions
+        light = sky.light(normal)
+        picture = wall.picture.point(sky.table(light, distance))
+        draw = ImageDraw.Draw(picture)
+        rng = np.random.default_rng([*photo.seed, b.seed])
+        if sky.snow:
+            white = sky.shade((238, 242, 248), sky.light(np.array([0.0, 1.0, 0.0])), distance)
+            for x0, x1, y in wall.ledges:
+                draw.rectangle((x0, y - 2.5, x1, y), fill=white)
+        if sky.dark:
+            share = 0.36 if sky.hour == "night" else 0.25
+            air = sky.veil(distance)
+            for box, chance in [(w, share) for w in wall.lights] + [(s, 0.85) for s in wall.shops]:
+                if rng.random() < chance and box[2] > box[0] and box[3] > box[1]:
+                    glow = (
+                        np.array([255, 214, 146])
+                        * rng.uniform(0.65, 1.0)
+                        * np.array([1.0, rng.uniform(0.92, 1.05), rng.uniform(0.75, 1.25)])
+                    )
+                    r, g, k = np.clip(glow * (1 - air) + sky.colours[1] * air, 0, 255).astype(int).tolist()
+                    draw.rectangle(box, fill=(r, g, k))
+                    mid = (box[0] + box[2]) / 2
+                    draw.line((mid, box[1], mid, box[3]), fill=(int(r * 0.4), int(g * 0.35), int(k * 0.3)), width=1)
+        return picture
+
+    def _roof(self, canvas: Image.Image, camera: Camera, sky: Conditions, b: Building, s: Surface, d: float) -> None:
+        colour = (236, 240, 246) if sky.snow else b.family.roof_colour
+        wide, deep = float(np.linalg.norm(np.array(s.right))), float(np.linalg.norm(np.array(s.down)))
+        base = cover(b, colour, wide, deep, sky.snow)
+        lay(canvas, camera, s, base.point(sky.table(sky.light(s.normal), d)), None)
