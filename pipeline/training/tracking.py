@@ -1,7 +1,8 @@
 """Runs in MLflow: parameters, metrics by step, artifacts, checkpoints; a local SQLite store unless told otherwise.
 
 Invariant: only rank 0 records, a run that is resumed continues its MLflow run, and a metric's name carries the
-protocol it was measured under (`city.shuffled16.recall_at_1`; MLflow allows no `@`). Recording never changes what is
+protocol it was measured under (`validation/city.shuffled16.recall_at_1`; MLflow allows no `@` and groups its charts by
+what stands before the slash). Recording never changes what is
 computed; a store that cannot be reached is an error at the start, not a surprise at the end.
 """
 

@@ -169,14 +169,14 @@ class Trainer:
             report = meter.report()
             self.tracker.metrics(
                 {
-                    "train.loss": report.loss,
-                    "train.mined_anchors": report.mined,
-                    "train.mined_positives": mined.positives,
-                    "train.mined_negatives": mined.negatives,
-                    "train.images_per_second": report.images_per_second,
-                    "train.data_wait": report.data_wait,
-                    "train.lr": rate,
-                    "train.epoch": state.epoch + state.cursor / self.steps_per_epoch,
+                    "train/loss": report.loss,
+                    "train/mined_anchors": report.mined,
+                    "train/mined_positives": mined.positives,
+                    "train/mined_negatives": mined.negatives,
+                    "train/images_per_second": report.images_per_second,
+                    "train/data_wait": report.data_wait,
+                    "train/lr": rate,
+                    "train/epoch": state.epoch + state.cursor / self.steps_per_epoch,
                 },
                 state.step,
             )

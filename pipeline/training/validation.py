@@ -42,7 +42,7 @@ class Validation:
         results = evaluate(model, self.sets, self.config, self.device)
         values: dict[str, float] = {}
         for result in results:
-            prefix = f"{result.set_name}.{result.protocol.name}"
+            prefix = f"validation/{result.set_name}.{result.protocol.name}"
             values |= {f"{prefix}.recall_at_{k}": value for k, value in result.recalls.items()}
             if show:
                 recalls = "  ".join(f"R@{k} {value:.1f}" for k, value in result.recalls.items())

@@ -1,0 +1,222 @@
+"""Recorded runs side by side: their metrics, and only the settings in which they differ.
+
+Invariant: numbers come from the MLflow store as recorded, each under the name that carries its protocol; recalls of
+different protocols are different rows, never averaged or mixed.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.training.tracking import open_client
+from shards.errors import UsageError
+
+RECALL = re.compile(r"^(?P<kind>\w+)/(?P<set>.+)\.(?P<protocol>[^.]+)\.recall_at_(?P<k>\d+)$")
+# where runs are recorded or how fast they run, not what they are
+UNINTERESTING = (
+    "name",
+    "output",
+    "tracking.",
+    "data.workers",
+    "data.prefetch",
+    "data.cache",
+    "train.log_",
+    "train.resume",
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A recorded run.
+
+    Attributes:
+        name: as given by the user; made unique by the MLflow id where several share it.
+        run_id: MLflow's.
+        status: MLflow's ("FINISHED", "RUNNING", "KILLED", "FAILED").
+        params: flat settings as text.
+        metrics: newest value by metric name.
+        history: (step, value) of each recall metric recorded at more than one step.
+    """
+
+    name: str
+    run_id: str
+    status: str
+    params: dict[str, str]
+    metrics: dict[str, float]
+    history: dict[str, list[tuple[int, float]]]
+
+
+def load_runs(uri: str, experiment: str, wanted: Sequence[str] = ()) -> list[Run]:
+    """Runs of an experiment, oldest first: those named (by name or id), or the newest of each name.
+
+    Raises:
+        UsageError: no such experiment, no such run (the known ones are listed), or nothing recorded.
+    """
+    client = open_client(uri)
+    found = client.get_experiment_by_name(experiment)
+    if found is None:
+        known = ", ".join(e.name for e in client.search_experiments())
+        raise UsageError(f"{uri} has no experiment '{experiment}'; it has: {known}")
+    entries: list[Any] = []
+    token = None
+    while True:
+        page = client.search_runs([found.experiment_id], order_by=["attributes.start_time ASC"], page_token=token)
+        entries += list(page)
+        token = page.token
+        if not token:
+            break
+    if not entries:
+        raise UsageError(f"experiment '{experiment}' in {uri} has no runs yet; train one first")
+    if wanted:
+        chosen = []
+        for key in wanted:
+            matches = [e for e in entries if key in (e.info.run_name, e.info.run_id)]
+            if not matches:
+                names = sorted({e.info.run_name for e in entries})
+                raise UsageError(f"experiment '{experiment}' has no run '{key}'; it has: {', '.join(names)}")
+            chosen.append(matches[-1])
+    else:
+        chosen = list({e.info.run_name: e for e in entries}.values())
+    names = [e.info.run_name for e in chosen]
+    runs = []
+    for entry in chosen:
+        name = entry.info.run_name
+        if names.count(name) > 1:
+            name = f"{name} {entry.info.run_id[:6]}"
+        metrics = {k: float(v) for k, v in sorted(entry.data.metrics.items())}
+        history = {
+            key: sorted((m.step, float(m.value)) for m in client.get_metric_history(entry.info.run_id, key))
+            for key in metrics
+            if key.startswith("validation/")
+        }
+        runs.append(Run(name, entry.info.run_id, entry.info.status, dict(entry.data.params), metrics, history))
+    return runs
+
+
+def differing_settings(runs: Sequence[Run]) -> list[tuple[str, list[str]]]:
+    """(setting, value in each run) of the settings that are not the same in all runs."""
+    keys = sorted({key for run in runs for key in run.params})
+    rows = [(key, [run.params.get(key, "-") for run in runs]) for key in keys]
+    return [(k, v) for k, v in rows if len(set(v)) > 1 and not k.startswith(UNINTERESTING)]
+
+
+def metric_rows(runs: Sequence[Run]) -> list[tuple[str, list[float | None]]]:
+    """(metric, value in each run): recalls first, by set, protocol and N; then loss and speed."""
+    keys = {key for run in runs for key in run.metrics}
+
+    def order(key: str) -> tuple[Any, ...]:
+        match = RECALL.match(key)
+        if match is None:
+            return (2, key)
+        kinds = {"evaluation": 0, "validation": 1}
+        return (0, kinds.get(match["kind"], 2), match["set"], match["protocol"], int(match["k"]))
+
+    shown = [k for k in keys if RECALL.match(k) or k in ("train/loss", "train/images_per_second")]
+    return [(key, [run.metrics.get(key) for run in runs]) for key in sorted(shown, key=order)]
+
+
+def best(metric: str, values: Sequence[float | None]) -> set[int]:
+    """Positions of the best value of a row where there is one: the highest recall, the lowest loss; else none."""
+    present = [v for v in values if v is not None]
+    if len(present) < 2 or len(set(present)) < 2 or not (RECALL.match(metric) or metric == "train/loss"):
+        return set()
+    target = min(present) if metric == "train/loss" else max(present)
+    return {i for i, v in enumerate(values) if v == target}
+
+
+def cells(runs: Sequence[Run]) -> list[list[str]]:
+    """The table: a head of run names, metric rows with the best marked `*`, then the settings that differ."""
+    table = [["", *[run.name for run in runs]]]
+    for metric, values in metric_rows(runs):
+        winners = best(metric, values)
+        digits = 4 if metric == "train/loss" else 1
+        row = ["-" if v is None else f"{v:.{digits}f}" + (" *" if i in winners else "") for i, v in enumerate(values)]
+        table.append([metric, *row])
+    for key, values_of_setting in differing_settings(runs):
+        table.append([key, *values_of_setting])
+    if any(run.status != "FINISHED" for run in runs):
+        table.append(["status", *[run.status.lower() for run in runs]])
+    return table
+
+
+def as_text(table: list[list[str]]) -> str:
+    """Aligned columns for a terminal."""
+    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
+    lines = ["  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
+             for row in table]  # fmt: skip
+    lines.insert(1, "  ".join("-" * w for w in widths))
+    return "\n".join(lines)
+
+
+def as_markdown(table: list[list[str]]) -> str:
+    """A markdown table, the best in bold."""
+
+    def cell(text: str) -> str:
+        return f"**{text[:-2]}**" if text.endswith(" *") else text.replace("|", "\\|")
+
+    head, *rows = [[cell(c) for c in row] for row in table]
+    rule = ["---", *["---:" for _ in head[1:]]]
+    return "\n".join("| " + " | ".join(row) + " |" for row in [head, rule, *rows]) + "\n"
+
+
+def write_csv(table: list[list[str]], path: Path) -> None:
+    """The same table, marks left out, for a spreadsheet."""
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([[c.removesuffix(" *") for c in row] for row in table])
+
+
+def draw_curves(runs: Sequence[Run], path: Path) -> bool:
+    """Recall@N over N for each set and protocol, and validation recall over steps; False when nothing is recorded."""
+    panels: dict[str, dict[str, list[tuple[int, float]]]] = {}
+    for run in runs:
+        for key, value in run.metrics.items():
+            match = RECALL.match(key)
+            if match is not None and match["kind"] == "evaluation":
+                title = f"{match['set']}, {match['protocol']}"
+                panels.setdefault(title, {}).setdefault(run.name, []).append((int(match["k"]), value))
+    progress: dict[str, dict[str, list[tuple[int, float]]]] = {}
+    for run in runs:
+        for key, points in run.history.items():
+            match = RECALL.match(key)
+            if match is not None and match["k"] == "5" and len(points) > 1:
+                title = f"validation {match['set']}, {match['protocol']}, R@5"
+                progress.setdefault(title, {})[run.name] = points
+    if not panels and not progress:
+        return False
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    total = len(panels) + len(progress)
+    columns = min(total, 4)
+    rows = -(-total // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(3.6 * columns, 3.2 * rows), squeeze=False, layout="constrained")
+    colours = {run.name: f"C{i}" for i, run in enumerate(runs)}
+    spots = list(axes.flat)
+    for axis, (title, lines, label) in zip(
+        spots,
+        [(t, c, "N database images retrieved") for t, c in sorted(panels.items())]
+        + [(t, c, "step") for t, c in sorted(progress.items())],
+        strict=False,
+    ):
+        for name, points in lines.items():
+            points = sorted(points)
+            axis.plot(*zip(*points, strict=True), marker="o", markersize=4, color=colours[name], label=name)
+        if label.startswith("N"):
+            axis.set_xticks(sorted({k for points in lines.values() for k, _ in points}))
+        axis.set(title=title, xlabel=label, ylabel="recall, %", ylim=(0, 102))
+        axis.title.set_fontsize(10)
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    for axis in spots[total:]:
+        axis.set_visible(False)
+    spots[0].legend(frameon=False, fontsize=9, loc="lower right")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+    return True
