@@ -1,0 +1,84 @@
+"""Predictions on disk: what was answered to each query, so that recalls, intervals and figures need no model.
+
+Invariant: a file holds one set under one protocol, with both in its schema, and a row for each query in set order.
+
+Columns: `query` (path), `rows` (list of database rows, best first), `distances` (squared L2), `positives` (list of
+correct rows), `rank` (from 0, of the first correct one; -1 where none is among the rows).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.evaluation.evaluate import Result
+from pipeline.evaluation.evaluation_set import EvaluationSet
+from pipeline.evaluation.protocol import Protocol
+from pipeline.evaluation.recall import first_hits
+from shards.errors import DataError
+
+META = b"place_recognition"
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """What `load_predictions` reads."""
+
+    set_name: str
+    protocol: Protocol
+    queries: list[str]
+    rows: np.ndarray
+    """int64 [Q, K], -1 where the database is smaller"""
+    distances: np.ndarray
+    """float32 [Q, K]"""
+    positives: list[np.ndarray]
+    ranks: np.ndarray
+    """int64 [Q]: recall@n is the mean of (0 <= ranks) & (ranks < n)"""
+
+
+def predictions_path(folder: Path, result: Result) -> Path:
+    """`<folder>/<set>.<protocol>.parquet`"""
+    return folder / f"{result.set_name}.{result.protocol.name}.parquet"
+
+
+def save_predictions(result: Result, evaluated: EvaluationSet, folder: Path) -> Path:
+    """Writes a result's predictions, whole or not at all; returns the file."""
+    about = {"set": result.set_name, "protocol": result.protocol.to_dict(), "database": result.database}
+    table = pa.table(
+        {
+            "query": pa.array([str(path) for path in evaluated.queries]),
+            "rows": pa.array(list(result.predictions), pa.list_(pa.int64())),
+            "distances": pa.array(list(result.distances.astype(np.float32)), pa.list_(pa.float32())),
+            "positives": pa.array([np.asarray(p, np.int64) for p in evaluated.positives], pa.list_(pa.int64())),
+            "rank": pa.array(first_hits(result.predictions, evaluated.positives)),
+        }
+    ).replace_schema_metadata({META: json.dumps(about)})
+    folder.mkdir(parents=True, exist_ok=True)
+    path = predictions_path(folder, result)
+    fresh = path.with_name(path.name + ".tmp")
+    pq.write_table(table, fresh, compression="zstd")
+    fresh.replace(path)
+    return path
+
+
+def load_predictions(path: Path) -> Predictions:
+    """Reads a file of `save_predictions`. Raises `DataError` for anything else."""
+    try:
+        table = pq.read_table(path)
+        about = json.loads(table.schema.metadata[META])
+    except (OSError, pa.ArrowInvalid, KeyError, TypeError) as error:
+        raise DataError(f"{path}: not a file of predictions ({error}); evaluate again") from None
+    return Predictions(
+        about["set"],
+        Protocol(**about["protocol"]),
+        table["query"].to_pylist(),
+        np.array(table["rows"].to_pylist(), np.int64),
+        np.array(table["distances"].to_pylist(), np.float32),
+        [np.array(p, np.int64) for p in table["positives"].to_pylist()],
+        table["rank"].to_numpy(),
+    )
