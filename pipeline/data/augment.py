@@ -129,7 +129,7 @@ def _posterize(image: Image.Image, share: float) -> Image.Image:
 
 def _solarize(image: Image.Image, share: float) -> Image.Image:
     # a whole-number threshold decides the same: pixels are whole, and `pixel < 178.5` is `pixel < 179`
-    return ImageOps.solarize(image, math.ceil(255 * (1 - share)))
+    return ImageOps.solarize(image, math.ceil(round(255 * (1 - share), 6)))
 
 
 def _enhance(kind: Callable[[Image.Image], ImageEnhance._Enhance]) -> Callable[[Image.Image, float], Image.Image]:

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from shards.index import ShardIndex
 
 BLOCK = 8 << 20  # bytes hashed and written at a time
-ATTEMPTS = 3
 
 
 def local_folder(root: str) -> Path | None:
@@ -48,6 +47,7 @@ class ShardCache:
         self.local = local_folder(index.root)
         self.base, self.limit = folder, limit
         self.folder = folder / index.digest[:16]  # sets never mix, also under equal shard names
+        self.attempts = 3  # to fetch a shard
         self.wanted: frozenset[str] = frozenset()  # evicted only when nothing else is left
 
     @property
@@ -106,7 +106,7 @@ class ShardCache:
         from fsspec.core import url_to_fs
 
         url, problem = f"{self.root}/{name}", ""
-        for attempt in range(ATTEMPTS):
+        for attempt in range(self.attempts):
             time.sleep(attempt)
             try:
                 system, remote = url_to_fs(url)
@@ -124,7 +124,7 @@ class ShardCache:
                 raise DataError(f"{url}: missing; restore it or prepare the shards again") from None
             except Exception as error:  # each file system has errors of its own, told below after the last attempt
                 problem = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise DataError(f"{url}: cannot be fetched after {ATTEMPTS} attempts ({problem})")
+        raise DataError(f"{url}: cannot be fetched after {self.attempts} attempts ({problem})")
 
     def _reserve(self, part: Path, size: int) -> None:
         """Makes room for `size` bytes and takes it with a sparse `part` of that size."""
