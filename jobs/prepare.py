@@ -46,7 +46,7 @@ class PrepareConfig:
     heading_deg: float = 30.0
     """utm: width of a place's heading sector in degrees; 0 puts all headings together."""
     workers: int = 0
-    """Processes; 0 is one a core. The bytes do not depend on it."""
+    """Processes; 0 is one a core, where there is work for it. The bytes do not depend on it."""
     overwrite: bool = False
     """Delete the shard set in --out first."""
     verify: str | None = None

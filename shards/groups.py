@@ -60,6 +60,7 @@ class GroupPlan:
     counts: np.ndarray  # [places] its photos
     bounds: tuple[int, ...]  # group g is order[bounds[g] : bounds[g + 1]]
     round_bytes: int  # about, of a round's shards
+    source_bytes: int  # of the photos that will be opened
 
     def __len__(self) -> int:
         return len(self.bounds) - 1
@@ -101,11 +102,12 @@ def plan_groups(catalogue: Catalogue, seed: int, shard_mb: float) -> GroupPlan:
     order = np.array(enough, np.int64)
     cumulated = np.cumsum(sample_bytes[order])
     total = float(cumulated[-1]) if len(order) else 0.0
+    opened = int(per_place["size_sum"].to_numpy()[order].sum())
     number = max(1, round(total / min(shard_mb * 1e6, max(1e6, total / 16))))
     middles = cumulated - sample_bytes[order] / 2  # a place belongs where its middle falls: groups of equal bytes
     group = np.minimum(middles * number / max(total, 1.0), number - 1).astype(np.int64)
     bounds = [0, *(np.flatnonzero(np.diff(group)) + 1).tolist(), len(order)] if len(order) else [0]
-    return GroupPlan(catalogue, order, starts, counts, tuple(bounds), int(total))
+    return GroupPlan(catalogue, order, starts, counts, tuple(bounds), int(total), opened)
 
 
 def shard_name(round_: int, group: int) -> str:

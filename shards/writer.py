@@ -36,6 +36,7 @@ from shards.shard_file import write_atomically
 
 SETTINGS = "settings.json"
 MAX_ROUNDS = 128  # as many files are open at once in each worker
+_BYTES_A_WORKER = 64_000_000  # photos worth a second of starting a process
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class WriteRule:
     image: ImageRule = field(default_factory=ImageRule)
     reading: dict[str, Any] = field(default_factory=dict)  # how the source was read (`sources.reading_settings`)
     max_bad: float = 0.01  # share of named images that may be missing or broken
-    workers: int = 0  # processes; 0: one a core
+    workers: int = 0  # processes; 0: one a core, where there is work for it
 
     def settings(self, catalogue: Catalogue) -> dict[str, Any]:
         """The manifest's settings."""
@@ -120,8 +121,7 @@ def _completed(rule: WriteRule, catalogue: Catalogue) -> WriteRule:
     if rule.shard_mb <= 0 or rule.workers < 0 or rule.image.resize < 0:
         raise UsageError("--shard-mb must be above 0, --workers and --resize not below 0")
     image = ImageRule(rule.image.check, rule.image.resize, catalogue.kind != "gsv_cities")
-    workers = rule.workers or len(os.sched_getaffinity(0))
-    return WriteRule(rule.rounds, rule.seed, float(rule.shard_mb), image, rule.reading, rule.max_bad, workers)
+    return WriteRule(rule.rounds, rule.seed, float(rule.shard_mb), image, rule.reading, rule.max_bad, rule.workers)
 
 
 def _already(out: Path, settings: dict[str, Any]) -> report.Summary | None:
@@ -204,7 +204,8 @@ def _begun(out: Path, settings: dict[str, Any]) -> Iterator[None]:
 def _write_groups(plan: groups.GroupPlan, out: Path, rule: WriteRule) -> Iterator[int]:
     """Writes all groups, in processes; yields the photos of each as it is finished."""
     tasks = plan.tasks(out, rule.seed, rule.rounds, rule.image)
-    workers = min(rule.workers, len(plan))
+    worth = 1 + plan.source_bytes // _BYTES_A_WORKER
+    workers = min(rule.workers or min(len(os.sched_getaffinity(0)), worth), len(plan))
     if workers == 1:
         yield from map(groups.write_group, tasks)
         return
