@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -83,8 +84,8 @@ def build(kind: str, root: Path, table: pa.Table, left_out: Sequence[LeftOut] = 
     paths = table["path"].to_pylist()
     first = {path: row for row, path in zip(reversed(range(len(paths))), reversed(paths), strict=True)}
     unique = table.take(pa.array(sorted(first.values()), pa.int64()))
-    listed = unique.group_by(["city", "place_id"], use_threads=False).aggregate([([], "count_all")])
-    listed = listed.rename_columns(["city", "place_id", "images"])
+    starts, counts = runs(unique)
+    listed = unique.select(["city", "place_id"]).take(pa.array(starts)).append_column("images", pa.array(counts))
     out = list(left_out)
     for row in unique.filter(pc.less_equal(unique["size"], 0)).to_pylist():
         reason = "missing" if row["size"] < 0 else "empty file (0 bytes)"
@@ -94,6 +95,20 @@ def build(kind: str, root: Path, table: pa.Table, left_out: Sequence[LeftOut] = 
     return Catalogue(
         kind, root, present, listed, tuple(sorted(out)), table.num_rows - unique.num_rows, unlisted, digest
     )
+
+
+def runs(table: pa.Table) -> tuple[np.ndarray, np.ndarray]:
+    """First row and number of rows (both int64) of each place of a table sorted by (city, place_id).
+
+    Not `Table.group_by`: its groups do not come in the order of their first rows.
+    """
+    change = np.zeros(table.num_rows, bool)
+    change[:1] = True
+    for name in ("city", "place_id"):
+        column = table[name].combine_chunks()
+        change[1:] |= pc.not_equal(column.slice(1), column.slice(0, max(len(column) - 1, 0))).to_numpy(False)
+    starts = np.flatnonzero(change).astype(np.int64)
+    return starts, np.diff(np.append(starts, table.num_rows)).astype(np.int64)
 
 
 def _digest(kind: str, table: pa.Table, left_out: list[LeftOut]) -> str:

@@ -22,7 +22,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from shards import index
-from shards.catalogue import Catalogue, LeftOut
+from shards.catalogue import Catalogue, LeftOut, runs
 from shards.images import ImageRule, Refused, admit
 from shards.rounds import IMAGES_A_PLACE, draw, permutation, rank
 from shards.shard_file import Member, ShardFile, sync_folder, write_atomically
@@ -90,19 +90,17 @@ def plan_groups(catalogue: Catalogue, seed: int, shard_mb: float) -> GroupPlan:
     A shard has about `shard_mb` MB (10^6 bytes) of the source's bytes, less where a round has under 16 such shards, so
     that small sets too are written in parallel and read in several windows, but at least about 1 MB.
     """
-    per_place = catalogue.table.group_by(["city", "place_id"], use_threads=False).aggregate(
-        [([], "count_all"), ("size", "sum")]
-    )
-    counts = per_place["count_all"].to_numpy()
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64) if len(counts) else np.zeros(0, np.int64)
-    sample_bytes = per_place["size_sum"].to_numpy() / np.maximum(counts, 1) * IMAGES_A_PLACE + _TAR_OVERHEAD
-    cities, ids = per_place["city"].to_pylist(), per_place["place_id"].to_pylist()
+    starts, counts = runs(catalogue.table)
+    place_bytes = np.add.reduceat(catalogue.table["size"].to_numpy(), starts) if len(starts) else starts
+    sample_bytes = place_bytes / np.maximum(counts, 1) * IMAGES_A_PLACE + _TAR_OVERHEAD
+    first = catalogue.table.select(["city", "place_id"]).take(pa.array(starts))
+    cities, ids = first["city"].to_pylist(), first["place_id"].to_pylist()
     enough = [p for p in range(len(cities)) if counts[p] >= IMAGES_A_PLACE]
     enough.sort(key=lambda p: (cities[p], rank(seed, cities[p], ids[p]), ids[p]))
     order = np.array(enough, np.int64)
     cumulated = np.cumsum(sample_bytes[order])
     total = float(cumulated[-1]) if len(order) else 0.0
-    opened = int(per_place["size_sum"].to_numpy()[order].sum())
+    opened = int(place_bytes[order].sum())
     number = max(1, round(total / min(shard_mb * 1e6, max(1e6, total / 16))))
     middles = cumulated - sample_bytes[order] / 2  # a place belongs where its middle falls: groups of equal bytes
     group = np.minimum(middles * number / max(total, 1.0), number - 1).astype(np.int64)
