@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -47,6 +48,10 @@ def test_all_places_of_gsv_cities(shared_dir: Path, tmp_path: Path, photo: Calla
     counts = opened.manifest["counts"]
     assert opened.table.num_rows == 2 * PLACES
     assert counts["places"] == PLACES and counts["places_under_four"] == 59_342 - PLACES
+    assert counts["places_fallen"] == 0 and counts["images_bad"] == 0
+    named = Counter((row["city_id"], row["place_id"]) for frame in frames for row in _read_frame(frame).to_pylist())
+    pairs = list(zip(opened.table["city"].to_pylist(), opened.table["place_id"].to_pylist(), strict=True))
+    assert Counter(pairs) == Counter({place: 2 for place, n in named.items() if n >= 4})
     assert counts["images_named"] + counts["duplicates"] == ROWS
     assert usage.ru_maxrss < 1_500_000  # kB
 
