@@ -31,6 +31,7 @@ from shards.progress import Progress
 
 BLOCK_BYTES = 64 * 2**20  # descriptors handed over at once: the memory of a gather, and the size of a stored part
 REGIONS_IN_MEMORY = 4 * 2**30  # bytes of regions a rank keeps in memory before it turns to a file
+TOLD = 5_000  # images from which the second step, quick beside the backbone, has a progress line of its own
 Block = list[np.ndarray]
 """Consecutive groups that are computed, gathered and stored together."""
 
@@ -170,7 +171,7 @@ def correlate(
     todo = [number for number in range(len(blocks)) if number not in done]
     total = sum(len(group) for number in todo for group in blocks[number])
     shape = regions.values.shape[1:]
-    with Progress(label, total, "images", enabled=progress and r == 0 and total > 0) as bar:
+    with Progress(label, total, "images", enabled=progress and r == 0 and total >= TOLD) as bar:
         for number in todo:
             block = blocks[number]
             own: list[Tensor] = []

@@ -94,7 +94,7 @@ def notes(results: Sequence[Result]) -> list[str]:
     if any(len(group) > 1 for _, group in _by_set(results)):
         lines["* best of its set; recalls in percent"] = None
     for result in results:
-        lines[f"{result.protocol.name} ({result.protocol.rule}): {result.protocol.describe()}"] = None
+        lines[f"{result.protocol.name}: {result.protocol.describe()}"] = None
     for result in results:
         if result.without_positives:
             done = "counted as misses" if result.protocol.without_positives == "miss" else "dropped"
