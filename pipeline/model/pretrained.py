@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from pipeline.model.names import fit, published_name, to_published
 from shards.errors import DataError, UsageError
 
+FILE = "model.safetensors"
 # wrappers that training codes put around a state dict
 WRAPPERS = ("model_state_dict", "state_dict", "model", "teacher")
 
@@ -36,9 +37,9 @@ def read_tensors(source: str) -> dict[str, Tensor]:
         if index.is_file():
             files = sorted(set(json.loads(index.read_text())["weight_map"].values()))
             return {name: t for file in files for name, t in _read_safetensors(path / file).items()}
-        if not (path / "model.safetensors").is_file():
+        if not (path / FILE).is_file():
             raise UsageError(f"{source}: the folder holds no model.safetensors")
-        return _read_safetensors(path / "model.safetensors")
+        return _read_safetensors(path / FILE)
     if path.is_file():
         return _read_safetensors(path) if path.suffix == ".safetensors" else _read_pickle(path)
     if path.suffix or source.count("/") != 1:
@@ -96,15 +97,19 @@ def unwrap(state: Mapping[str, Any], source: str) -> dict[str, Tensor]:
 
 
 def _from_hub(name: str) -> Path:
-    from huggingface_hub import hf_hub_download
+    from huggingface_hub import HfApi, hf_hub_download
 
     try:
-        return Path(hf_hub_download(name, "model.safetensors"))
-    except Exception as error:  # the client's own errors and those of every network library under it
-        raise UsageError(
-            f"{name}: no such file or folder here, and the model hub did not give it ({_line(error)}); "
-            "download the weights and give their path"
-        ) from error
+        return Path(hf_hub_download(name, FILE, local_files_only=True))
+    except Exception as missing:  # not fetched before: ask the hub, once, before the download begins its long retries
+        try:
+            HfApi().model_info(name, timeout=10)
+            return Path(hf_hub_download(name, FILE))
+        except Exception as error:  # the client's own errors and those of every network library under it
+            raise UsageError(
+                f"{name}: no such file or folder here, and the model hub did not give it ({_line(error)}); "
+                "download the weights and give their path"
+            ) from missing
 
 
 def _line(error: Exception) -> str:

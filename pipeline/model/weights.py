@@ -169,12 +169,10 @@ def checkpoint_file(path: str | Path) -> Path:
     given = Path(path)
     if given.is_file():
         return given
-    candidates = [given, given / "checkpoints" / "best", given / "best"]
-    for pointer in (given / "last", given / "checkpoints" / "last"):
-        if pointer.is_file():
-            name = pointer.read_text().strip()
-            candidates += [given / name, given / "checkpoints" / name]
-    for folder in candidates:
+    places = [given / "checkpoints" / "best", given / "best", given / "checkpoints" / "last", given / "last"]
+    for folder in (given, *places):
+        if folder.is_file():  # a pointer in a text file instead of a link
+            folder = folder.parent / folder.read_text().strip()
         if (folder / FILE).is_file():
             return folder / FILE
     raise UsageError(f"{given}: no model there (a .safetensors file, a checkpoint folder, or a run folder is wanted)")
