@@ -7,12 +7,15 @@ the same; a set that is missing or malformed raises `DataError` naming the folde
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation import layouts
+from pipeline.evaluation import layouts, msls
 from pipeline.evaluation.evaluation_set import EvaluationSet, clean_name, list_images
+from pipeline.evaluation.fixed_lists import from_lists, list_prefix
+from pipeline.evaluation.manifest import SUFFIXES, from_manifest
 from pipeline.evaluation.published import SETS, count_remark, published_name
 from shards.errors import DataError, UsageError
 
@@ -36,7 +39,7 @@ def load_set(name_or_path: str, config: EvaluationConfig) -> EvaluationSet:
         text, _, route = text.rpartition(":")
     name = published_name(text)
     if name is not None:
-        folder = _find(config.root, SETS[name].folders)
+        folder = _find(config.root, name, config.split)
         if folder is None:
             raise DataError(_missing(name, config.root))
         return _load_published(name, folder, config, route)
@@ -52,7 +55,9 @@ def load_set(name_or_path: str, config: EvaluationConfig) -> EvaluationSet:
             f"{text}: neither a path, nor a folder below root '{config.root}', nor one of the sets "
             f"{', '.join(sorted(SETS))}"
         )
-    return _load_path(path, config, route)
+    loaded = _load_path(path, config, route)
+    # a folder called as a published set is compared with it: MSLS with 11,000 queries is not MSLS-val
+    return _remarked(loaded, published_name(loaded.name), config.split)
 
 
 def _load_published(name: str, folder: Path, config: EvaluationConfig, route: str) -> EvaluationSet:
@@ -70,9 +75,16 @@ def _load_published(name: str, folder: Path, config: EvaluationConfig, route: st
     elif entry.layout == "gardens_point":
         title = clean_name(f"{name}_{route}".replace("->", "_in_")) if route else name
         loaded = layouts.traverses(title, folder, config, route or DEFAULT_ROUTE, entry.frames)
+    elif entry.layout == "msls_val":
+        loaded = msls.val(name, folder, config)
     else:
-        raise DataError(_missing(name, config.root, folder))
-    remark = count_remark(name, config.split, len(loaded.database), len(loaded.queries))
+        loaded = msls.challenge(name, folder, config)
+    return _remarked(loaded, name, config.split)
+
+
+def _remarked(loaded: EvaluationSet, name: str | None, split: str) -> EvaluationSet:
+    """With a remark where its counts are not the published ones."""
+    remark = count_remark(name, split, len(loaded.database), len(loaded.queries)) if name else None
     return dataclasses.replace(loaded, remarks=(*loaded.remarks, remark)) if remark else loaded
 
 
@@ -86,6 +98,17 @@ def _load_path(path: Path, config: EvaluationConfig, route: str) -> EvaluationSe
         base = layouts.split_folder(path, config.split)
         if base is not None:
             return layouts.from_folders(name, base, config)
+        if msls.original_cities(path):
+            return msls.val("msls_val", path, config)
+        if msls.challenge_cities(path):
+            return msls.challenge("msls_challenge", path, config)
+        if layouts.pair_folders(path, config.split) is not None:
+            return layouts.pairs(name, path, config)
+    elif path.suffix.lower() in SUFFIXES:
+        return from_manifest(path, config)
+    prefix = list_prefix(path, config.split)
+    if prefix is not None:
+        return from_lists(prefix, config)
     raise DataError(
         f"{path}: no evaluation set here; expected images/{config.split}/{{database,queries}}, database/ and queries/, "
         "a .csv or .parquet manifest, or *_dbImages.npy with *_qImages.npy"
@@ -98,11 +121,27 @@ def _path_name(path: Path, config: EvaluationConfig) -> str:
     return clean_name(parts[-1] if parts else "set")
 
 
-def _find(root: str, folders: tuple[str, ...]) -> Path | None:
-    """The first of `folders` below `root`, in any case."""
+def _find(root: str, name: str, split: str) -> Path | None:
+    """The folder below `root`, in any case, where the set lies; else the first that has one of its names."""
     below = Path(root).expanduser()
     present = {p.name.lower(): p for p in sorted(below.iterdir()) if p.is_dir()} if below.is_dir() else {}
-    return next((present[name.lower()] for name in folders if name.lower() in present), None)
+    named = [present[alias.lower()] for alias in SETS[name].folders if alias.lower() in present]
+    return next((folder for folder in named if _is_there(name, folder, split)), named[0] if named else None)
+
+
+def _is_there(name: str, folder: Path, split: str) -> bool:
+    """Whether `folder` has the set's layout; looks at folders only."""
+    entry = SETS[name]
+    looks: dict[str, Callable[[], object]] = {
+        "utm": lambda: layouts.split_folder(folder, split, entry.queries),
+        "svox": lambda: layouts.split_folder(folder, split, entry.queries),
+        "pairs": lambda: layouts.pair_folders(folder, split),
+        "nordland": lambda: layouts.nordland_folders(folder, split),
+        "gardens_point": lambda: (folder / "day_right").is_dir() or None,
+        "msls_val": lambda: msls.original_cities(folder) or msls.utm_base(folder),
+        "msls_challenge": lambda: msls.challenge_cities(folder) or None,
+    }
+    return looks[entry.layout]() is not None
 
 
 def _missing(name: str, root: str, folder: Path | None = None) -> str:
@@ -128,7 +167,9 @@ def available(root: str, split: str = "test") -> list[Availability]:
     found = []
     known: set[str] = set()
     for name, entry in SETS.items():
-        folder = _find(root, entry.folders)
+        folder = _find(root, name, split)
+        if folder is not None and not _is_there(name, folder, split):
+            folder = None
         known |= {alias.lower() for alias in entry.folders}
         found.append(Availability(name, folder, _missing(name, root).partition("expected ")[2]))
     for folder in sorted(below.iterdir()) if below.is_dir() else []:

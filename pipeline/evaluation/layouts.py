@@ -82,17 +82,22 @@ def by_frame(
     )
 
 
+def pair_folders(folder: Path, split: str) -> tuple[Path, Path] | None:
+    """Database and query folders of a set in pairs: new/old, ref/query, or the common ones."""
+    base = split_folder(folder, split)
+    common = [(base / "database", base / "queries")] if base is not None else []
+    for database, queries in (*common, (folder / "new", folder / "old"), (folder / "ref", folder / "query")):
+        if database.is_dir() and queries.is_dir():
+            return database, queries
+    return None
+
+
 def pairs(name: str, folder: Path, config: EvaluationConfig) -> EvaluationSet:
     """One to one by file name (AmsterTime, SPED): new/old, ref/query, or the common folders."""
-    base = split_folder(folder, config.split)
-    for database, queries in ((folder / "new", folder / "old"), (folder / "ref", folder / "query")):
-        if base is None and database.is_dir() and queries.is_dir():
-            in_database, in_queries = list_images(database), list_images(queries)
-            break
-    else:
-        if base is None:
-            raise DataError(f"{folder}: expected new/ and old/, ref/ and query/, or images/{config.split}/...")
-        in_database, in_queries = list_images(database_folder(base) or base), list_images(base / "queries")
+    found = pair_folders(folder, config.split)
+    if found is None:
+        raise DataError(f"{folder}: expected new/ and old/, ref/ and query/, or images/{config.split}/...")
+    in_database, in_queries = (list_images(side) for side in found)
     matches = paired([_pair_key(p) for p in in_database], [_pair_key(p) for p in in_queries], str(folder))
     return EvaluationSet(name, in_database, in_queries, matches, "pairs")
 
@@ -103,21 +108,26 @@ def _pair_key(path: Path) -> str:
     return path.stem if position is None else f"@{position[0]:.2f}@{position[1]:.2f}"
 
 
+def nordland_folders(folder: Path, split: str) -> tuple[Path, Path] | None:
+    """Nordland's summer and winter: the common folders, summer/winter, or ref/query, where ref is winter."""
+    base = split_folder(folder, split)
+    common = [(base / "database", base / "queries")] if base is not None else []
+    for summer, winter in (*common, (folder / "summer", folder / "winter"), (folder / "query", folder / "ref")):
+        if summer.is_dir() and winter.is_dir():
+            return summer, winter
+    return None
+
+
 def nordland(name: str, folder: Path, config: EvaluationConfig, frames: int, sparse: bool) -> EvaluationSet:
     """Nordland in its two protocols.
 
     `**` (`sparse` False): each winter frame is a query, summer is the database, +- 10 frames. `*`: every tenth summer
     frame is a query, winter is the database, +- 1 frame of 10 i.
     """
-    base = split_folder(folder, config.split)
-    if base is not None:
-        summer, winter = database_folder(base) or base, base / "queries"
-    elif (folder / "summer").is_dir() and (folder / "winter").is_dir():
-        summer, winter = folder / "summer", folder / "winter"
-    elif (folder / "ref").is_dir() and (folder / "query").is_dir():  # the layout of the * protocol: ref is winter
-        summer, winter = folder / "query", folder / "ref"
-    else:
+    found = nordland_folders(folder, config.split)
+    if found is None:
         raise DataError(f"{folder}: expected summer/ and winter/, ref/ and query/, or images/{config.split}/...")
+    summer, winter = found
     in_summer, in_winter = list_images(summer, natural=True), list_images(winter, natural=True)
     frames = frames if config.frames is None else config.frames
     if not sparse:

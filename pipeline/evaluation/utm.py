@@ -86,7 +86,7 @@ def to_utm(latitude: np.ndarray, longitude: np.ndarray, zone: int | None = None)
     if not good.all():
         at = int(np.argmin(good))
         raise DataError(
-            f"row {at}: latitude {latitude[at]}, longitude {longitude[at]} is no place on Earth, in degrees"
+            f"row {at + 1}: latitude {latitude[at]}, longitude {longitude[at]} is no place on Earth, in degrees"
         )
     if len(latitude) == 0:
         return np.zeros((0, 2))
@@ -96,7 +96,7 @@ def to_utm(latitude: np.ndarray, longitude: np.ndarray, zone: int | None = None)
     if np.abs(offset).max() > 20:
         at = int(np.argmax(np.abs(offset)))
         raise DataError(
-            f"row {at}: longitude {longitude[at]} is {abs(offset[at]):.0f} degrees from the middle of UTM zone {zone}; "
+            f"row {at + 1}: longitude {longitude[at]} is {abs(offset[at]):.0f} degrees from the middle of UTM zone {zone}; "
             "make one set a region, or give utm_east and utm_north"
         )
     phi, lam = np.radians(latitude), np.radians(offset)
