@@ -41,20 +41,25 @@ def rank_slice(total: int, r: int | None = None, w: int | None = None) -> slice:
     return slice(total * r // w, total * (r + 1) // w)
 
 
+# torch 2.13 renamed the two and warns about the old names; earlier ones know only those
+_all_gather = getattr(dist, "all_gather_single", None) or dist.all_gather_into_tensor
+_reduce_scatter = getattr(dist, "reduce_scatter_single", None) or dist.reduce_scatter_tensor
+
+
 class _Gather(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, local: Tensor) -> Tensor:
         w = dist.get_world_size()
         local = local.contiguous()
         gathered = local.new_empty((w * local.shape[0], *local.shape[1:]))
-        dist.all_gather_into_tensor(gathered, local)
+        _all_gather(gathered, local)
         return gathered
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Tensor:  # [B, ...] -> [b, ...]
         grad = grads[0].contiguous()
         own = grad.new_empty((grad.shape[0] // dist.get_world_size(), *grad.shape[1:]))
-        dist.reduce_scatter_tensor(own, grad, op=dist.ReduceOp.SUM)
+        _reduce_scatter(own, grad, op=dist.ReduceOp.SUM)
         return own
 
 

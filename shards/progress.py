@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import TypeVar
 
 Item = TypeVar("Item")
+QUIET = 1.0  # seconds: work shorter than this leaves no line in a log
 
 
 class Progress:
@@ -30,6 +31,7 @@ class Progress:
     ) -> None:
         self.label, self.total, self.unit, self.every, self.enabled = label, total, unit, every, enabled
         self.done = self._before = 0
+        self._note = ""
         self._start = self._last = time.monotonic()
         self._bar = None
         if enabled and sys.stderr.isatty():
@@ -46,13 +48,14 @@ class Progress:
     def advance(self, n: int = 1, note: str = "") -> None:
         """Adds n finished units; `note` is shown beside them."""
         self.done += n
+        self._note = note
         if self._bar is not None:
             if note:
                 self._bar.set_postfix_str(note, refresh=False)
             self._bar.update(n)
         elif self.enabled and time.monotonic() - self._last >= self.every:
             self._last = time.monotonic()
-            self._line(note)
+            self._line()
 
     def resume_at(self, done: int) -> None:
         """Counts `done` units as finished earlier; the rate leaves them out."""
@@ -64,15 +67,15 @@ class Progress:
         """Ends the bar, or prints the closing plain line."""
         if self._bar is not None:
             self._bar.close()
-        elif self.enabled and not failed:
-            self._line("")
+        elif self.enabled and not failed and time.monotonic() - self._start >= QUIET:
+            self._line()
 
-    def _line(self, note: str) -> None:
+    def _line(self) -> None:
         seconds = max(time.monotonic() - self._start, 1e-9)
         of = f"/{self.total:,}" if self.total is not None else ""
         rate = (self.done - self._before) / seconds
         print(
-            f"{self.label}: {self.done:,}{of} {self.unit}, {rate:,.1f} a second  {note}".rstrip(),
+            f"{self.label}: {self.done:,}{of} {self.unit}, {rate:,.1f} a second  {self._note}".rstrip(),
             file=sys.stderr,
             flush=True,
         )

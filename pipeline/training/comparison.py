@@ -17,17 +17,11 @@ from pipeline.training.tracking import open_client
 from shards.errors import UsageError
 
 RECALL = re.compile(r"^(?P<kind>\w+)/(?P<set>.+)\.(?P<protocol>[^.]+)\.recall_at_(?P<k>\d+)$")
-# where runs are recorded or how fast they run, not what they are
+# where runs are recorded, how often and how fast, not what they are
 UNINTERESTING = (
-    "name",
-    "output",
-    "tracking.",
-    "data.workers",
-    "data.prefetch",
-    "data.cache",
-    "train.log_",
-    "train.resume",
-)
+    "name", "output", "tracking.", "data.workers", "data.prefetch", "data.cache", "validate.workers",
+    "train.log_", "train.resume", "train.save_every", "train.keep", "train.timeout",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ class Engine:
 
     Args:
         accelerator: owns device, precision and wrapping.
-        model: on the CPU, identical on all ranks.
+        model: on the CPU, identical on all ranks; afterwards `self.model`, inside its wrapper `self.module`.
         build: makes the optimiser over the parameters of the module it is given.
         clip: largest gradient norm, or None.
     """
@@ -47,14 +47,8 @@ class Engine:
         self._wrap(model, build)
 
     def _wrap(self, model: PlaceModel, build: BuildOptimizer) -> None:
-        optimizer = build(model.parameters())
-        self.module, self.optimizer = self.accelerator.prepare(model, optimizer)
-
-    @property
-    def model(self) -> PlaceModel:
-        """The model inside the wrapper."""
-        inner: PlaceModel = self.accelerator.unwrap_model(self.module, keep_torch_compile=False)
-        return inner
+        self.model = model  # the wrapper holds this very object
+        self.module, self.optimizer = self.accelerator.prepare(model, build(model.parameters()))
 
     def names(self) -> dict[str, nn.Parameter]:
         """Trainable parameters by the model's names."""
@@ -153,13 +147,8 @@ class ShardedEngine(Engine):
                     if any(True for _ in block.parameters()):
                         fully_shard(block, **options)
         fully_shard(model, **options)
-        self.module = model
+        self.model = self.module = model
         self.optimizer = build(model.parameters())
-
-    @property
-    def model(self) -> PlaceModel:
-        sharded: PlaceModel = self.module
-        return sharded
 
     @contextmanager
     def plain(self) -> Iterator[PlaceModel]:

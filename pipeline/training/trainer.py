@@ -263,12 +263,20 @@ class Trainer:
                 problem = error
         else:
             self.tracker = Tracker(config, enabled=False)
+            self._forget_samples()
         problem = broadcast_object(problem)
         if problem is not None:
             raise problem
         barrier()
         path = self.run / f"samples.rank{rank()}.jsonl"
         self.samples = path.open("a") if config.train.log_samples else None
+
+    def _forget_samples(self) -> None:
+        """Drops the log of steps that a kill lost after the checkpoint: they are about to be taken again."""
+        for path in self.run.glob("samples.rank*.jsonl"):
+            whole = [line for line in path.read_text().splitlines() if line.endswith("}")]
+            kept = [line for line in whole if json.loads(line)["step"] <= self.state.step]
+            path.write_text("".join(line + "\n" for line in kept))
 
     def _ended(self) -> str:
         """Why the run is over, or ""."""
