@@ -1,0 +1,135 @@
+"""Verification finds every kind of damage, and an index is never read from a set that is not whole."""
+
+from __future__ import annotations
+
+import json
+import random
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from shards import index
+from shards.errors import DataError
+from shards.sources import read_source
+from shards.writer import WriteRule, write_shards
+
+
+@pytest.fixture
+def shard_set(gsv: Callable[..., Path], tmp_path: Path) -> Path:
+    out = tmp_path / "out"
+    write_shards(read_source(gsv({"PRS": [4, 5, 6, 2], "OSL": [4]})), out, WriteRule(2, workers=1, shard_mb=0.03))
+    return out
+
+
+def flip(path: Path, bit: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(data)
+
+
+def test_a_whole_set_has_no_problems(shard_set: Path) -> None:
+    assert index.verify(str(shard_set)) == []
+
+
+@pytest.mark.parametrize("pattern", ["round-*.tar", index.INDEX, index.MANIFEST, index.REPORT])
+def test_one_flipped_bit_anywhere_is_found(pattern: str, shard_set: Path) -> None:
+    """Twenty bits spread over each kind of file, the first and the last among them, one at a time."""
+    path = sorted(shard_set.glob(pattern))[-1]
+    bits = path.stat().st_size * 8
+    for bit in [0, bits - 1, *random.Random(1).sample(range(bits), 18)]:
+        flip(path, bit)
+        problems = index.verify(str(shard_set))
+        assert problems and path.name in problems[0], f"bit {bit} of {path.name}: {problems}"
+        flip(path, bit)
+    assert index.verify(str(shard_set)) == []
+
+
+def test_truncated_missing_and_extra_files_are_each_named(shard_set: Path) -> None:
+    first, second, third = sorted(shard_set.glob("*.tar"))[:3]
+    first.write_bytes(first.read_bytes()[:-512])
+    second.unlink()
+    (shard_set / "round-00-99999.tar").write_bytes(third.read_bytes())
+    (shard_set / "unfinished").mkdir()
+    problems = index.verify(str(shard_set))
+    assert len(problems) == 4
+    for name, what in (
+        (first.name, "bytes, the manifest says"),
+        (second.name, "missing"),
+        ("round-00-99999.tar", "not part of the set"),
+        ("unfinished", "not part of the set"),
+    ):
+        assert any(problem.startswith(name) and what in problem for problem in problems), problems
+
+
+def test_exchanged_shards_are_found(shard_set: Path) -> None:
+    first, second = sorted(shard_set.glob("*.tar"))[:2]
+    one, two = first.read_bytes(), second.read_bytes()
+    first.write_bytes(two)
+    second.write_bytes(one)
+    assert len(index.verify(str(shard_set))) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [(index.MANIFEST, "no manifest.json there .not a shard set"), (index.INDEX, "index.parquet is missing")],
+)
+def test_an_incomplete_set_is_not_opened(name: str, message: str, shard_set: Path) -> None:
+    (shard_set / name).unlink()
+    assert any(name in problem for problem in index.verify(str(shard_set)))
+    with pytest.raises(DataError, match=message):
+        index.read_index(str(shard_set))
+
+
+def test_a_changed_index_is_not_opened(shard_set: Path) -> None:
+    flip(shard_set / index.INDEX, 999)
+    with pytest.raises(DataError, match=r"index\.parquet has changed"):
+        index.read_index(str(shard_set))
+
+
+def test_an_edited_manifest_is_not_opened(shard_set: Path) -> None:
+    path = shard_set / index.MANIFEST
+    manifest = json.loads(path.read_bytes())
+    manifest["counts"]["places"] += 1
+    path.write_bytes(index.canonical(manifest))
+    with pytest.raises(DataError, match=r"manifest\.json has changed"):
+        index.read_index(str(shard_set))
+
+
+def test_another_format_version_is_told(shard_set: Path) -> None:
+    path = shard_set / index.MANIFEST
+    path.write_bytes(index.sealed_manifest({**json.loads(path.read_bytes()), "format_version": 99}))
+    with pytest.raises(DataError, match="format version 99"):
+        index.read_index(str(shard_set))
+
+
+def test_no_folder_and_nonsense_are_told(tmp_path: Path) -> None:
+    assert index.verify(str(tmp_path / "nowhere")) == ["no such folder"]
+    with pytest.raises(DataError, match="not a shard set"):
+        index.read_index(str(tmp_path / "nowhere"))
+    for nonsense in (b"", b"[]", b"null", b"{", b"\xff\xfe"):
+        (tmp_path / index.MANIFEST).write_bytes(nonsense)
+        assert index.verify(str(tmp_path))
+        with pytest.raises(DataError):
+            index.read_index(str(tmp_path))
+
+
+def test_a_set_behind_a_url_is_read_and_verified(shard_set: Path) -> None:
+    memory = fsspec.filesystem("memory")
+    memory.put(str(shard_set), "/bucket/set", recursive=True)
+    url = "memory://bucket/set"
+    local, remote = index.read_index(str(shard_set)), index.read_index(url)
+    assert remote.table.equals(local.table) and remote.digest == local.digest and remote.root == url
+    assert index.verify(url) == []
+    memory.pipe("/bucket/set/extra.tar", b"1")
+    assert index.verify(url) == ["extra.tar is not part of the set"]
+    memory.rm("/bucket", recursive=True)
+
+
+def test_a_moved_set_is_the_same_set(shard_set: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "elsewhere"
+    before = index.read_index(str(shard_set)).digest
+    shutil.move(shard_set, moved)
+    assert index.verify(str(moved)) == [] and index.read_index(str(moved)).digest == before
