@@ -22,7 +22,7 @@ from pipeline.config import EvaluationConfig
 from pipeline.evaluation.descriptors import evaluating
 from pipeline.evaluation.engine import Engine, on_rank_0
 from pipeline.evaluation.evaluation_set import EvaluationSet
-from pipeline.evaluation.projection import Projection, fit_rows, projected, sample_rows
+from pipeline.evaluation.projection import Projection, fit_rows, load_projection, projected, sample_rows
 from pipeline.evaluation.protocol import Protocol, Side, protocols
 from pipeline.evaluation.recall import recall_at
 from pipeline.evaluation.retrieval import (
@@ -117,10 +117,13 @@ def fit_projections(
     config: EvaluationConfig,
     device: torch.device | str,
     progress: bool = True,
+    beside: Path | None = None,
+    fingerprint: str = "",
 ) -> dict[str, Projection]:
     """PCA of `source`'s database for every grouping: name of the grouping -> projection. Collective.
 
-    At most `projection.SAMPLE` images, seeded; groups are formed over the sample. Ranks other than 0 get {}.
+    At most `projection.SAMPLE` images, seeded; groups are formed over the sample. Kept in the folder `beside`, under
+    a name with the weights' `fingerprint`, and read from there the next time. Ranks other than 0 get {}.
     """
     model, device = getattr(model, "module", model), torch.device(device)
     rows = sample_rows(len(source.database))
@@ -135,22 +138,32 @@ def fit_projections(
         query_part=None,
     )
     fitted: dict[str, Projection] = {}
+    chosen = protocols(config, model.image_size, source.rule)  # type: ignore[arg-type]
+
+    def file(protocol: Protocol) -> Path | None:
+        name = f"pca-{config.pca}{'w' if protocol.whiten else ''}.{source.name}.{protocol.grouping.name}"
+        return None if beside is None else beside / f"{name}.{fingerprint}.safetensors"
+
+    def read() -> list[Protocol]:
+        kept = {p: path for p in chosen if (path := file(p)) is not None and path.is_file()}
+        fitted.update({p.grouping.name: load_projection(path) for p, path in kept.items()})
+        return [p for p in chosen if p not in kept]
+
+    def fit(blocks: Blocks | None, protocol: Protocol) -> None:
+        about = f"{source.name} database, {len(rows)} of {len(source.database)} images, {protocol.grouping.name}"
+        projection = fit_rows(_there(blocks), np.arange(len(rows)), config.pca or 0, protocol.whiten, about, device)
+        fitted[protocol.grouping.name] = projection
+        if (path := file(protocol)) is not None:
+            projection.save(path)
+
+    missing = on_rank_0(read)
+    if not missing:
+        return fitted
     with evaluating(model), tempfile.TemporaryDirectory() as temporary:
         engine = Engine(model, config, device, None, Path(temporary), progress, "")
-        chosen = protocols(config, engine.model.image_size, source.rule)
-        side = engine.side(sampled, "database", chosen)
-        for protocol in chosen:
-            blocks = side.describe(protocol)
-
-            def fit(blocks: Blocks | None = blocks, protocol: Protocol = protocol) -> None:
-                about = (
-                    f"{source.name} database, {len(rows)} of {len(source.database)} images, {protocol.grouping.name}"
-                )
-                fitted[protocol.grouping.name] = fit_rows(
-                    _there(blocks), np.arange(len(rows)), config.pca or 0, protocol.whiten, about, device
-                )
-
-            on_rank_0(fit)
+        side = engine.side(sampled, "database", missing)
+        for protocol in missing:
+            on_rank_0(partial(fit, side.describe(protocol), protocol))
         side.close()
     return fitted
 

@@ -63,7 +63,7 @@ class Protocol:
             parts.append("drop")
         parts += [value for value in (self.precision, self.search) if value not in ("fp32", "exact")]
         if self.stored != "fp32":
-            parts.append(f"stored-{self.stored}")
+            parts.append(f"{self.stored}store")
         return "_".join(parts)
 
     @property

@@ -1,0 +1,113 @@
+"""Recall of a checkpoint with its protocol, on every set that is there, in all three groupings.
+
+    python -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k,msls_val --root data
+    accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k
+
+Prints one table and writes results.json, results.md, results.csv, predictions/, figures/ and report.html. The number of
+processes changes nothing but the time. Sets that are missing are named and left out; exit code 3 when none is there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from jobs.cli import parse, run_job
+from pipeline.config import EvaluationConfig, to_dict
+from shards.errors import DataError, UsageError, UserError
+
+
+@dataclass(frozen=True)
+class EvaluateJob(EvaluationConfig):
+    """Evaluate a checkpoint. Without `sets`, every set found under `root`."""
+
+    checkpoint: str = ""
+    """A run folder (its best checkpoint), a checkpoint folder, a .safetensors file, or a released CricaVPR .pth."""
+    output: str | None = None
+    """Folder of all results; none: `<run>/evaluation`."""
+    figures: bool = True
+    """Draw figures and the HTML report."""
+    timeout: float = 1800.0
+    """Seconds that a process waits for the others."""
+
+
+def main() -> None:
+    """Parses, evaluates, reports."""
+    job = parse(EvaluateJob, __doc__ or "", listed(sys.argv[1:]))
+    if not job.checkpoint:
+        raise UsageError("--checkpoint is missing: a run folder such as outputs/cricavpr, or a model file")
+    config = EvaluationConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(EvaluationConfig)})
+    from pipeline.training.launch import finish, start
+
+    accelerator = start(job.timeout)
+    try:
+        run(job, config, accelerator)
+    except UserError as error:
+        if accelerator.is_main_process:
+            raise
+        sys.exit(error.exit_code)  # rank 0 tells it
+    finally:
+        del accelerator
+        finish()
+
+
+def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None:
+    """The evaluation on this process; rank 0 writes."""
+    from pipeline.evaluation import report, tables
+    from pipeline.evaluation.datasets import available, load_set
+    from pipeline.evaluation.evaluate import evaluate, fit_projections, model_fingerprint
+    from pipeline.evaluation.predictions import save_predictions
+    from pipeline.model.weights import checkpoint_file, load_model, load_published
+
+    device, first = accelerator.device, accelerator.is_main_process  # type: ignore[attr-defined]
+    file = checkpoint_file(job.checkpoint)
+    model = load_published(file).to(device) if file.suffix == ".pth" else load_model(file, device)
+    names = config.sets or tuple(a.name for a in available(config.root, config.split) if a.folder is not None)
+    sets, left_out = [], []
+    for name in names:
+        try:
+            sets.append(load_set(name, config))
+        except DataError as error:
+            left_out.append(f"{name}: {error}")
+    if not sets:
+        raise DataError("; ".join(left_out) or f"no evaluation set under {config.root}/: give --sets or --root")
+    for line in left_out if first else ():
+        print(f"left out: {line}", file=sys.stderr)
+    runs = [parent.parent for parent in file.parents if parent.name == "checkpoints"]
+    output = Path(job.output) if job.output else (runs[0] if runs else file.parent) / "evaluation"
+    fingerprint = model_fingerprint(model)
+    projections = None
+    if config.pca and config.pca_from:
+        source = load_set(config.pca_from, dataclasses.replace(config, split="train"))
+        projections = fit_projections(model, source, config, device, beside=file.parent, fingerprint=fingerprint)
+    results = evaluate(model, sets, config, device, output, True, projections, fingerprint)
+    if not first:
+        return
+    print(tables.terminal(results))
+    about = {"checkpoint": str(file), "fingerprint": fingerprint, "descriptor_dim": model.descriptor_dim}
+    plain = {**about, "model": to_dict(model.config), "evaluation": to_dict(config), "left_out": left_out}
+    tables.write_json(results, output / "results.json", plain)
+    tables.write_csv(results, output / "results.csv")
+    (output / "results.md").write_text(tables.markdown(results))
+    for result in results:
+        save_predictions(result, next(s for s in sets if s.name == result.set_name), output / "predictions")
+    if job.figures:
+        pictures = report.draw(results, sets, output / "figures")
+        facts = {key: str(value) for key, value in about.items()}
+        report.write_report(results, pictures, output / "report.html", f"Evaluation of {file.parent.name}", facts)
+    print(f"\nwritten to {output}/" + (": open report.html in a browser" if job.figures else ""))
+
+
+def listed(argv: list[str]) -> list[str]:
+    """`--sets a,b` as well as `--sets '[a, b]'`."""
+    words = list(argv)
+    for i, word in enumerate(words[1:], 1):
+        if words[i - 1] in ("--sets", "--groups", "--recalls") and not word.startswith("["):
+            words[i] = "[" + ", ".join(f'"{w}"' if words[i - 1] != "--recalls" else w for w in word.split(",")) + "]"
+    return words
+
+
+if __name__ == "__main__":
+    run_job(main)
