@@ -92,11 +92,14 @@ class Surface:
     @cached_property
     def normal(self) -> Array:
         """Unit vector towards the side from which it is seen."""
-        n = np.cross(np.array(self.right), np.array(self.down))
-        return np.asarray(n / np.linalg.norm(n))
+        (a, b, c), (d, e, f) = self.right, self.down
+        n = np.array([b * f - c * e, c * d - a * f, a * e - b * d])
+        return np.asarray(n / math.sqrt(float(n @ n)))
 
     def faces(self, camera: Camera) -> bool:
-        return bool(self.normal @ (camera.place - np.array(self.corner)) > 0.01)
+        x, y, z = self.normal.tolist()
+        u, v, w = self.corner
+        return bool(x * (camera.x - u) + y * (camera.y - v) + z * (camera.z - w) > 0.01)
 
 
 def lay(canvas: Image.Image, camera: Camera, surface: Surface, picture: Image.Image, alpha: Image.Image | None) -> None:

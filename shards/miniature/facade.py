@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from shards.miniature.landmark import church, mural, tower
-from shards.miniature.painter import PX, Painter, Wall, finish, pattern, tone, window
+from shards.miniature.painter import PX, Painter, Wall, pattern, tone, window
 from shards.miniature.place import Building
 from shards.miniature.styles import RGB, SIGN_COLOURS, SIGNS
 
@@ -30,7 +30,7 @@ def front(building: Building) -> Wall:
     pattern(p, family, colour, rng)
     if building.landmark == "tower":
         tower(p, building, rng)
-        return finish(p, rng)
+        return p.wall
     shop = rng.random() < family.shops and width > 4.5
     _floors(p, building, rng, shop)
     _ground(p, building, rng, shop, colour)
@@ -41,7 +41,7 @@ def front(building: Building) -> Wall:
         p.rect(0, top - 0.35, width, top, tone(family.trim, 0.92))
         p.rect(0, top - 0.5, width, top - 0.35, tone(family.trim, 0.6))
         p.wall.ledges.append((0, width * PX, (p.height - top) * PX))
-    return finish(p, rng)
+    return p.wall
 
 
 def side(building: Building, width: float) -> Wall:
@@ -59,7 +59,7 @@ def side(building: Building, width: float) -> Wall:
             for x in np.arange(1.6, width - 1.6, family.bay * 2):
                 if rng.random() < 0.35:
                     window(p, family, float(x), floor * family.storey + 1.2, 0.9, 1.4, rng)
-    return finish(p, rng)
+    return p.wall
 
 
 def _floors(p: Painter, b: Building, rng: np.random.Generator, shop: bool) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from PIL import Image, ImageDraw
 
-from shards.miniature.painter import PX, Painter, Wall, finish, pattern, tone, window
+from shards.miniature.painter import PX, Painter, Wall, pattern, tone, window
 from shards.miniature.place import Building
 
 
@@ -29,7 +29,7 @@ def church(b: Building, w: float, rng: np.random.Generator) -> Wall:
     ImageDraw.Draw(alpha).polygon([(x * PX, (p.height - y) * PX) for x, y in top], fill=0)
     p.draw.line([(x * PX, (p.height - y) * PX) for x, y in top[1:4]], fill=tone(b.family.trim, 0.9), width=6)
     p.wall.alpha = alpha
-    return finish(p, rng)
+    return p.wall
 
 
 def tower(p: Painter, b: Building, rng: np.random.Generator) -> None:

@@ -86,7 +86,7 @@ def _weather(rng: np.random.Generator, heading: float, only: str | None = None) 
     skies = ["clear", "overcast", "rain", "fog", "snowfall"]
     if only == "query":
         season = str(rng.choice(list(SEASON_MONTHS), p=[0.15, 0.15, 0.35, 0.35]))
-        hour = str(rng.choice(hours, p=[0.14, 0.14, 0.17, 0.22, 0.33]))
+        hour = str(rng.choice(hours, p=[0.17, 0.18, 0.18, 0.2, 0.27]))
         sky = str(rng.choice(skies, p=[0.36, 0.26, 0.2, 0.1, 0.08]))
     else:
         hour = str(rng.choice(hours, p=[0.2, 0.25, 0.23, 0.15, 0.17]))
@@ -138,7 +138,7 @@ def _training_place(seed: int, index: int) -> PlacePhotos:
         key = (seed, 18, SPLITS["train"], index, view)
         rng = np.random.default_rng(key)
         conditions = _weather(rng, heading)
-        x, z, y, yaw, zoom = _pose(rng, 5.0, 0.16)
+        x, z, y, yaw, zoom = _pose(rng, 4.5, 0.14)
         latitude, longitude = to_degrees(*_standing(east, north, heading, x, z), ZONE)
         year, month = int(rng.integers(2008, 2024)), int(rng.choice(SEASON_MONTHS[conditions.season]))
         bearing = int(heading + math.degrees(yaw)) + (360 if rng.random() < 0.1 else 0)  # raw, as in the original
@@ -161,9 +161,9 @@ def _evaluation_place(seed: int, split: str, index: int) -> PlacePhotos:
         rng = np.random.default_rng(key)
         folder = "database" if view < 4 else "queries"
         conditions = _weather(rng, heading, "survey" if view < 4 else "query")
-        x, z, y, yaw, zoom = _pose(rng, 6.0, 0.14)
+        x, z, y, yaw, zoom = _pose(rng, 5.0, 0.1)
         if view < 4:  # a survey turns its camera step by step
-            yaw += (-0.3, -0.1, 0.1, 0.3)[view]
+            yaw += (-0.24, -0.08, 0.08, 0.24)[view]
         utm = _standing(east, north, heading, x, z)
         year = int(rng.integers(2012, 2015)) if view < 4 else int(rng.integers(2016, 2023))
         month = int(rng.choice(SEASON_MONTHS[conditions.season]))

@@ -6,7 +6,7 @@ Invariant: a cut-out depends on its arguments alone and is drawn once a process.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -23,8 +23,16 @@ class Cutout:
     alpha: Image.Image
     width: float
     lights: tuple[tuple[float, float, float, float], ...] = ()
+    _levels: dict[int, tuple[Image.Image, Image.Image]] = field(default_factory=dict)
+
+    def level(self, shrink: int) -> tuple[Image.Image, Image.Image]:
+        """Picture and outline at 1 / shrink of their size."""
+        if shrink not in self._levels:
+            self._levels[shrink] = (self.picture.reduce(shrink), self.alpha.reduce(shrink))
+        return self._levels[shrink]
 
 
+SPECIES = ("round", "poplar", "plane", "palm", "conifer", "cypress")
 LEAVES: dict[str, tuple[RGB, ...]] = {
     "spring": ((122, 158, 74), (142, 172, 88), (216, 176, 186)),
     "summer": ((62, 106, 50), (76, 120, 56), (54, 96, 52)),
@@ -91,7 +99,7 @@ def tree(species: str, season: str, snow: bool, variant: int) -> Cutout:
             stroke, rng, middle, height * 0.55, -math.pi / 2, height * 0.17, 5, 0.5 if species != "poplar" else 0.25
         )
         if not bare:
-            n = 260 if species != "poplar" else 200
+            n = 520 if species != "poplar" else 380
             for k in range(n):
                 a, r = rng.uniform(0, 2 * math.pi), math.sqrt(rng.random())
                 x, y = (
@@ -100,7 +108,7 @@ def tree(species: str, season: str, snow: bool, variant: int) -> Cutout:
                 )
                 lit = 0.72 + 0.5 * (k / n) - 0.28 * math.sin(a) * r * -1 * -1 + 0.12 * rng.normal()
                 lit = min(max(lit, 0.5), 1.35)
-                blob(x, y, float(rng.uniform(4.5, 9.5)), tuple(int(min(c * lit, 255)) for c in leaf))
+                blob(x, y, float(rng.uniform(2.6, 6.4)), tuple(int(min(c * lit, 255)) for c in leaf))
     if snow and bare:
         noise = rng.random((height, width)) < 0.35
         picture.paste((232, 236, 242), mask=Image.fromarray((noise * 255).astype(np.uint8)))
@@ -213,9 +221,9 @@ def vehicle(kind: str, paint: int, rear: bool) -> Cutout:
         wheels, r = (0.2, 0.8), 0.065 * w
     for x in wheels:
         for radius, colour in ((r, black), (r * 0.5, (150, 150, 152))):
-            box = (x * w - radius, h - r - radius, x * w + radius, h - r + radius)
-            draw.ellipse(box, fill=colour)
-            cut.ellipse(box, fill=255)
+            rim = (x * w - radius, h - r - radius, x * w + radius, h - r + radius)
+            draw.ellipse(rim, fill=colour)
+            cut.ellipse(rim, fill=255)
     front_and_rear = ((w * 0.955, h * 0.56, w * 0.998, h * 0.66), (w * 0.002, h * 0.54, w * 0.03, h * 0.64))
     draw.rectangle(front_and_rear[0], fill=(236, 230, 206))
     draw.rectangle(front_and_rear[1], fill=(170, 36, 34))

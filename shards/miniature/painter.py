@@ -29,6 +29,14 @@ class Wall:
     lights: list[Box] = field(default_factory=list)  # windows, in pixels of the picture
     shops: list[Box] = field(default_factory=list)  # shop windows and signs: lit all evening
     ledges: list[tuple[float, float, float]] = field(default_factory=list)  # x0, x1, y where snow rests
+    _levels: dict[int, tuple[Image.Image, Image.Image | None]] = field(default_factory=dict)
+
+    def level(self, shrink: int) -> tuple[Image.Image, Image.Image | None]:
+        """Picture and outline at 1 / shrink of their size, for walls far away."""
+        if shrink not in self._levels:
+            alpha = self.alpha.reduce(shrink) if self.alpha is not None else None
+            self._levels[shrink] = (self.picture.reduce(shrink), alpha)
+        return self._levels[shrink]
 
 
 @lru_cache(maxsize=4)
@@ -82,38 +90,44 @@ class Painter:
         )
 
 
-def finish(p: Painter, rng: np.random.Generator) -> Wall:
-    """Grain and a darker foot, then done."""
-    noise = grain(int(rng.integers(4)))
-    x, y = int(rng.integers(0, 1024 - min(p.size[0], 1023))), int(rng.integers(0, 512 - min(p.size[1], 511)))
-    tile = noise.crop((x, y, x + p.size[0], y + p.size[1]))
-    if tile.size != p.size or p.size[0] > 1024 or p.size[1] > 512:
-        tile = noise.resize(p.size)
-    p.wall.picture = ImageChops.multiply(p.image, Image.merge("RGB", (tile, tile, tile)))
-    return p.wall
+@lru_cache(maxsize=16)
+def masonry(kind: str) -> Image.Image:
+    """A 512 x 512 RGB relief of courses and stains, to multiply a wall's colour with."""
+    rng = np.random.default_rng([3, *map(ord, kind)])
+    relief = Image.new("L", (512, 512), 255)
+    draw = ImageDraw.Draw(relief)
+    if kind == "brick":
+        for x, y, shade in zip(
+            rng.uniform(0, 512, 900), rng.integers(0, 171, 900) * 3, rng.integers(205, 240, 900), strict=True
+        ):
+            draw.rectangle((x, y, x + 5, y + 1), fill=int(shade))
+        for y in range(2, 512, 3):
+            draw.line((0, y, 512, y), fill=216)
+    elif kind == "stone":
+        for row, y in enumerate(range(0, 512, 8)):
+            draw.line((0, y, 512, y), fill=214)
+            for x in range(9 * (row % 2), 512, 18):
+                draw.line((x, y, x, y + 8), fill=222)
+    elif kind == "timber":
+        for y in range(0, 512, 4):
+            draw.line((0, y, 512, y), fill=214)
+    noise = grain(len(kind) % 4).crop((0, 0, 512, 512))
+    relief = ImageChops.multiply(relief, noise)
+    return Image.merge("RGB", (relief, relief, relief))
 
 
 def pattern(p: Painter, family: Family, colour: RGB, rng: np.random.Generator) -> None:
+    """The bare wall: its colour under the family's masonry, with the joints of panels or a plaster's painted foot."""
     w, h = p.width, p.height
-    if family.pattern == "brick":
-        light, dark = tone(colour, 1.12), tone(colour, 0.86)
-        for y in np.arange(0, h, 0.2):
-            p.rect(0, y, w, y + 0.07, dark)
-        for x, y, n in zip(rng.uniform(0, w, 60), rng.uniform(0, h, 60), rng.integers(0, 2, 60), strict=True):
-            p.rect(x, y - y % 0.2 + 0.07, x + 0.4, y - y % 0.2 + 0.2, light if n else dark)
-    elif family.pattern == "stone":
-        for row, y in enumerate(np.arange(0, h, 0.55)):
-            p.rect(0, y, w, y + 0.07, tone(colour, 0.86))
-            for x in np.arange(0.6 * (row % 2), w, 1.2):
-                p.rect(x, y, x + 0.07, y + 0.55, tone(colour, 0.88))
-    elif family.pattern == "panel":
-        for y in np.arange(0, h, family.storey):
-            p.rect(0, y, w, y + 0.14, tone(colour, 0.78))
-        for x in np.arange(0, w, family.bay):
-            p.rect(x, 0, x + 0.08, h, tone(colour, 0.85))
-    elif family.pattern == "timber":
-        for y in np.arange(0, h, 0.28):
-            p.rect(0, y, w, y + 0.07, tone(colour, 0.84))
+    tile = masonry(family.pattern)
+    x, y = int(rng.integers(0, 512 - min(p.size[0], 500))), int(rng.integers(0, 512 - min(p.size[1], 500)))
+    tile = tile.crop((x, y, x + p.size[0], y + p.size[1])) if max(p.size) <= 500 else tile.resize(p.size)
+    p.image.paste(ImageChops.multiply(p.image, tile))
+    if family.pattern == "panel":
+        for v in np.arange(0, h, family.storey):
+            p.rect(0, float(v), w, float(v) + 0.14, tone(colour, 0.78))
+        for u in np.arange(0, w, family.bay):
+            p.rect(float(u), 0, float(u) + 0.08, h, tone(colour, 0.85))
     elif family.pattern == "plaster" and rng.random() < 0.5:
         p.rect(0, 0, w, float(rng.uniform(0.5, 1.1)), tone(colour, 0.8))
 

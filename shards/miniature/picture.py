@@ -12,16 +12,18 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from shards.miniature import facade
+from shards.miniature.atmosphere import Atmosphere
 from shards.miniature.camera import Array, Camera, Surface, lay
+from shards.miniature.ground import Ground
 from shards.miniature.layout import Photo
 from shards.miniature.lens import develop
-from shards.miniature.painter import Wall
+from shards.miniature.painter import PX, Wall
 from shards.miniature.place import Building, make_place
-from shards.miniature.roof import cover, slopes
+from shards.miniature.roof import cover, slopes, stacks
 from shards.miniature.scenery import Scenery
 from shards.miniature.weather import Conditions
 
-OVERSAMPLE = 1.5
+OVERSAMPLE = 1.25
 Step = tuple[float, Callable[[], None]]
 
 
@@ -49,7 +51,9 @@ class Studio:
         scene = Scenery(canvas, camera, self.place, photo.conditions, rng)
         scene.sky()
         scene.skyline()
-        scene.ground()
+        ground = Ground(canvas, camera, self.place, photo.conditions)
+        ground.draw()
+        ground.shadows()
         steps: list[Step] = scene.things() + scene.traffic()
         for building in self.place.buildings:
             x = min(max(camera.x, building.x0), building.x1)
@@ -59,7 +63,9 @@ class Studio:
                 steps.append((distance + 0.5, lambda b=building, d=distance: self._build(canvas, camera, photo, b, d)))  # type: ignore[misc]
         for _, step in sorted(steps, key=lambda item: -item[0]):
             step()
-        scene.air()
+        above = Atmosphere(canvas, camera, self.place, photo.conditions)
+        above.glow()
+        above.air(rng)
         return develop(canvas, size, photo.conditions, rng)
 
     def _wall(self, number: int, building: Building, full: bool, width: float) -> Wall:
@@ -76,6 +82,11 @@ class Studio:
             "east": Surface((b.x1, up, b.z0), (0, 0, deep), (0, -up, 0)),
             "west": Surface((b.x0, up, b.z1), (0, 0, -deep), (0, -up, 0)),
         }
+        for outline, colour in stacks(b):
+            polygon = camera.polygon(outline)
+            if polygon:
+                light = photo.conditions.light(np.array([0.0, 0.0, -1.0]))
+                ImageDraw.Draw(canvas).polygon(polygon, fill=photo.conditions.shade(colour, light, distance))
         for surface in slopes(b):
             if surface.faces(camera):
                 self._roof(canvas, camera, photo.conditions, b, surface, distance)
@@ -88,38 +99,39 @@ class Studio:
                 extra = wall.height - up
                 x, y, z = plane.corner
                 plane = Surface((x, y + extra, z), plane.right, (0, -up - extra, 0))
-            picture = self._lit(wall, plane.normal, photo, distance, b)
-            lay(canvas, camera, plane, picture, wall.alpha)
+            nearest = max(distance, 1.0)
+            ratio = PX * nearest / camera.focal  # pixels of the wall for one of the canvas
+            shrink = 4 if ratio >= 4 else 2 if ratio >= 2 else 1
+            lay(canvas, camera, plane, self._lit(wall, plane.normal, photo, distance, b, shrink), wall.level(shrink)[1])
 
-    def _lit(self, wall: Wall, normal: Array, photo: Photo, distance: float, b: Building) -> Image.Image:
-        """The wall's picture in the photo's light, with snow and lit windows."""
+    def _lit(self, wall: Wall, normal: Array, photo: Photo, distance: float, b: Building, shrink: int) -> Image.Image:
+        """The wall's picture at 1 / shrink of its size in the photo's light, with snow and lit windows."""
         sky = photo.conditions
-        light = sky.light(normal)
-        picture = wall.picture.point(sky.table(light, distance))
+        picture = sky.relight(wall.level(shrink)[0], sky.light(normal), distance)
         draw = ImageDraw.Draw(picture)
         rng = np.random.default_rng([*photo.seed, b.seed])
         if sky.snow:
             white = sky.shade((238, 242, 248), sky.light(np.array([0.0, 1.0, 0.0])), distance)
             for x0, x1, y in wall.ledges:
-                draw.rectangle((x0, y - 2.5, x1, y), fill=white)
+                draw.rectangle((x0 / shrink, (y - 2.5) / shrink, x1 / shrink, y / shrink), fill=white)
         if sky.dark:
             share = 0.36 if sky.hour == "night" else 0.25
             air = sky.veil(distance)
-            for box, chance in [(w, share) for w in wall.lights] + [(s, 0.85) for s in wall.shops]:
-                if rng.random() < chance and box[2] > box[0] and box[3] > box[1]:
-                    glow = (
-                        np.array([255, 214, 146])
-                        * rng.uniform(0.65, 1.0)
-                        * np.array([1.0, rng.uniform(0.92, 1.05), rng.uniform(0.75, 1.25)])
-                    )
+            panes = [(w, share) for w in wall.lights] + [(s, 0.85) for s in wall.shops]
+            chances, tints = rng.random(len(panes)), rng.uniform((0.65, 0.92, 0.75), (1.0, 1.05, 1.25), (len(panes), 3))
+            for (box, chance), drawn, (power, green, blue) in zip(panes, chances, tints, strict=True):
+                x0, y0, x1, y1 = (v / shrink for v in box)
+                if drawn < chance and x1 > x0 and y1 > y0:
+                    glow = np.array([255, 214 * green, 146 * blue]) * power
                     r, g, k = np.clip(glow * (1 - air) + sky.colours[1] * air, 0, 255).astype(int).tolist()
-                    draw.rectangle(box, fill=(r, g, k))
-                    mid = (box[0] + box[2]) / 2
-                    draw.line((mid, box[1], mid, box[3]), fill=(int(r * 0.4), int(g * 0.35), int(k * 0.3)), width=1)
+                    draw.rectangle((x0, y0, x1, y1), fill=(r, g, k))
+                    if shrink == 1:
+                        mid = (x0 + x1) / 2
+                        draw.line((mid, y0, mid, y1), fill=(int(r * 0.4), int(g * 0.35), int(k * 0.3)), width=1)
         return picture
 
     def _roof(self, canvas: Image.Image, camera: Camera, sky: Conditions, b: Building, s: Surface, d: float) -> None:
         colour = (236, 240, 246) if sky.snow else b.family.roof_colour
         wide, deep = float(np.linalg.norm(np.array(s.right))), float(np.linalg.norm(np.array(s.down)))
         base = cover(b, colour, wide, deep, sky.snow)
-        lay(canvas, camera, s, base.point(sky.table(sky.light(s.normal), d)), None)
+        lay(canvas, camera, s, sky.relight(base, sky.light(s.normal), d), None)

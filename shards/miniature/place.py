@@ -93,7 +93,7 @@ def make_place(town: int, seed: tuple[int, ...]) -> Place:
     view = float(rng.uniform(-0.45, 0.45)) if kind != "avenue" else float(rng.uniform(-0.22, 0.22))
     if gap:
         view = float(np.arctan2((gap[0] + gap[1]) / 2 * 0.6, front)) + float(rng.uniform(-0.2, 0.2))
-    kerb = float(front) - float(rng.uniform(2.8, 4.5)) if kind != "square" else 7.0
+    kerb = float(front) - float(rng.uniform(2.8, 4.5)) if kind != "square" else 11.0
     zebra = float(rng.uniform(-9, 9)) if rng.random() < 0.35 else None
     return Place(
         style, kind, tuple(buildings), tuple(things), skyline, hills, kerb, float(front), gap, zebra, view, heading
@@ -194,7 +194,7 @@ def _furnish(
         for side in (-1, 1):
             if rng.random() < 0.6:
                 species, step = pick(), float(rng.uniform(8, 13))
-                for z in np.arange(float(rng.uniform(7, 12)), 90, step):
+                for z in np.arange(float(rng.uniform(13, 18)), 90, step):
                     if rng.random() < 0.85:
                         things.append(
                             Thing(
@@ -205,7 +205,7 @@ def _furnish(
                                 int(rng.integers(4)),
                             )
                         )
-            for z in np.arange(float(rng.uniform(8, 14)), 90, 22.0):
+            for z in np.arange(float(rng.uniform(10, 16)), 90, 22.0):
                 things.append(Thing("lamp", side * (front - 3.2), float(z), 5.5, 0))
     else:
         if rng.random() < 0.75:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import numpy as np
 from PIL import Image, ImageDraw
 
-from shards.miniature.camera import Surface
+from shards.miniature.camera import Array, Surface
 from shards.miniature.painter import PX, tone
 from shards.miniature.place import Building
 from shards.miniature.styles import RGB
@@ -57,3 +58,26 @@ def cover(b: Building, colour: RGB, wide: float, deep: float, snow: bool) -> Ima
     """The tiles (or the snow) of a roof's slope, `wide` x `deep` metres, with a mansard's dormers."""
     dormers = max(int(wide / b.family.bay / 1.3), 1) if b.family.roof == "mansard" else 0
     return _cover(colour, max(int(wide * PX), 8), max(int(deep * PX), 8), snow, dormers, 0)
+
+
+def stacks(b: Building) -> list[tuple[Array, RGB]]:
+    """Chimneys, aerials and water tanks: upright polygons [n, 3] with their colours, to be drawn before the roof."""
+    rng = np.random.default_rng([b.seed, 23])
+    wide, up, found = b.x1 - b.x0, b.height, []
+    if b.landmark == "tower":
+        mid, half, z = (b.x0 + b.x1) / 2, wide / 2 + 0.2, (b.z0 + b.z1) / 2
+        spire = [(mid - half, up - 0.1, z), (mid, up + wide * 1.5, z), (mid + half, up - 0.1, z)]
+        return [(np.array(spire), (92, 118, 112))]
+    if "south" not in b.fronts or b.landmark:
+        return []
+    for _ in range(int(rng.integers(0, 3))):
+        x, z = b.x0 + 0.4 + float(rng.random()) * max(wide - 1.6, 0), b.z0 + float(rng.uniform(2.5, 5))
+        rise = {"flat": 1.3, "mansard": 4.6}.get(b.family.roof, min(wide, 9) * 0.28 + 1.4)
+        box = [(x, up - 0.5, z), (x, up + rise, z), (x + 0.8, up + rise, z), (x + 0.8, up - 0.5, z)]
+        found.append((np.array(box), tone((150, 96, 80), float(rng.uniform(0.7, 1.1)))))
+    if b.family.roof == "flat" and b.floors > 2 and wide > 6 and rng.random() < 0.4:
+        x, z, r = b.x0 + 1 + float(rng.random()) * (wide - 5), b.z0 + 4.0, 1.4
+        legs = [(x + 0.3, up, z), (x + 0.3, up + 1.6, z), (x + 2 * r - 0.3, up + 1.6, z), (x + 2 * r - 0.3, up, z)]
+        tank = [(x, up + 1.5, z), (x, up + 4, z), (x + r, up + 5, z), (x + 2 * r, up + 4, z), (x + 2 * r, up + 1.5, z)]
+        found += [(np.array(legs), (70, 64, 60)), (np.array(tank), (124, 94, 72))]
+    return found

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from PIL import Image
 
 from shards.miniature.camera import Array
 
@@ -21,8 +22,8 @@ HOURS: dict[str, tuple[Colour, Colour, Colour, Colour, float, float]] = {
     "morning": ((112, 158, 214), (236, 222, 200), (0.60, 0.62, 0.68), (0.52, 0.44, 0.32), 24, 105),
     "noon": ((74, 132, 206), (196, 218, 236), (0.62, 0.64, 0.68), (0.50, 0.48, 0.43), 55, 180),
     "afternoon": ((92, 142, 204), (226, 220, 206), (0.60, 0.61, 0.65), (0.54, 0.46, 0.34), 32, 242),
-    "dusk": ((72, 78, 128), (244, 164, 110), (0.46, 0.42, 0.48), (0.30, 0.16, 0.08), 6, 275),
-    "night": ((12, 16, 34), (58, 50, 56), (0.17, 0.18, 0.25), (0.0, 0.0, 0.0), 30, 180),
+    "dusk": ((72, 78, 128), (244, 164, 110), (0.52, 0.47, 0.53), (0.30, 0.16, 0.08), 6, 275),
+    "night": ((14, 19, 42), (70, 60, 66), (0.29, 0.29, 0.37), (0.0, 0.0, 0.0), 30, 180),
 }
 
 
@@ -83,9 +84,11 @@ class Conditions:
         up = 0.9 + 0.1 * float(normal[1])
         return np.asarray(ambient * up + sun * max(0.0, float(normal @ self.to_sun)))
 
-    def table(self, light: Array, distance: float) -> list[int]:
-        """The 768 entries with which `Image.point` lights an RGB picture and lays `distance` metres of air over it."""
-        return list(_table(tuple(light.tolist()), tuple(self.colours[1].tolist()), self.veil(distance)))
+    def relight(self, picture: Image.Image, light: Array, distance: float) -> Image.Image:
+        """An RGB picture in this light behind `distance` metres of air."""
+        veil = self.veil(distance)
+        (r, g, b), (x, y, z) = (light * (1 - veil)).tolist(), (self.colours[1] * 0.96 * veil).tolist()
+        return picture.convert("RGB", (r, 0, 0, x, 0, g, 0, y, 0, 0, b, z))
 
     def veil(self, distance: float) -> float:
         """Share of the air's own colour at this distance."""
@@ -97,12 +100,3 @@ class Conditions:
         mixed = np.clip(np.array(colour) * light * (1 - veil) + self.colours[1] * 0.96 * veil, 0, 255)
         r, g, b = mixed.astype(int).tolist()
         return r, g, b
-
-
-def _table(light: tuple[float, ...], air: tuple[float, ...], veil: float) -> list[int]:
-    levels = np.arange(256, dtype=np.float64)
-    rows = [levels * light[c] * (1 - veil) + air[c] * 0.96 * veil for c in range(3)]
-    # a soft shoulder keeps sunlit white walls from burning out
-    joined = np.concatenate(rows)
-    joined = np.where(joined > 215, 215 + (joined - 215) * 0.5, joined)
-    return [int(v) for v in np.clip(joined, 0, 255)]
