@@ -90,7 +90,7 @@ def _remarked(loaded: EvaluationSet, name: str | None, split: str) -> Evaluation
 
 def _load_path(path: Path, config: EvaluationConfig, route: str) -> EvaluationSet:
     """A set by what lies at `path`."""
-    name = _path_name(path, config)
+    name = _path_name(path)
     if path.is_dir():
         if route or (path / "day_left").is_dir():
             title = clean_name(f"{name}_{route}".replace("->", "_in_")) if route else name
@@ -115,9 +115,11 @@ def _load_path(path: Path, config: EvaluationConfig, route: str) -> EvaluationSe
     )
 
 
-def _path_name(path: Path, config: EvaluationConfig) -> str:
+def _path_name(path: Path) -> str:
     """The dataset's folder: .../miniature for .../miniature/images/val as well."""
-    parts = [part for part in path.resolve().with_suffix("").parts if part not in ("images", "processed", *SPLITS)]
+    whole = path.resolve()
+    named = whole.with_suffix("") if whole.is_file() else whole
+    parts = [part for part in named.parts if part not in ("images", "processed", *SPLITS)]
     return clean_name(parts[-1] if parts else "set")
 
 

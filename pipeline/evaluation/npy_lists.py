@@ -50,24 +50,41 @@ class _Array:
         self.state = state
 
 
-def _reconstruct(*_: Any) -> _Array:
-    """Stand-in for numpy's `_reconstruct(ndarray, (0,), b"b")`."""
-    return _Array()
+class _Function:
+    """Stand-in for a function: an object without attributes, so that a file cannot set any on it either."""
+
+    __slots__ = ()
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError("it sets the state of a function")
 
 
-def _encode(text: Any, encoding: Any = "latin1", *_: Any) -> bytes:
-    """Stand-in for `_codecs.encode`, by which protocol 2 writes bytes; latin-1 and nothing else."""
-    if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
-        raise pickle.UnpicklingError(f"encoding {encoding!r}")
-    return text.encode("latin-1")
+class _Reconstruct(_Function):
+    """For numpy's `_reconstruct(ndarray, (0,), b"b")`, which every pickled array begins with."""
+
+    __slots__ = ()
+
+    def __call__(self, *_: Any) -> _Array:
+        return _Array()
+
+
+class _Encode(_Function):
+    """For `_codecs.encode`, by which protocol 2 writes bytes; latin-1 and nothing else."""
+
+    __slots__ = ()
+
+    def __call__(self, text: Any, encoding: Any = "latin1", *_: Any) -> bytes:
+        if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
+            raise pickle.UnpicklingError(f"encoding {encoding!r}")
+        return text.encode("latin-1")
 
 
 _KNOWN = {
     ("numpy", "ndarray"): _Array,
     ("numpy", "dtype"): _Dtype,
-    ("numpy.core.multiarray", "_reconstruct"): _reconstruct,
-    ("numpy._core.multiarray", "_reconstruct"): _reconstruct,
-    ("_codecs", "encode"): _encode,
+    ("numpy.core.multiarray", "_reconstruct"): _Reconstruct(),
+    ("numpy._core.multiarray", "_reconstruct"): _Reconstruct(),
+    ("_codecs", "encode"): _Encode(),
 }
 
 

@@ -96,8 +96,8 @@ def to_utm(latitude: np.ndarray, longitude: np.ndarray, zone: int | None = None)
     if np.abs(offset).max() > 20:
         at = int(np.argmax(np.abs(offset)))
         raise DataError(
-            f"row {at + 1}: longitude {longitude[at]} is {abs(offset[at]):.0f} degrees from the middle of UTM zone {zone}; "
-            "make one set a region, or give utm_east and utm_north"
+            f"row {at + 1}: longitude {longitude[at]} is {abs(offset[at]):.0f} degrees from the middle of UTM zone "
+            f"{zone}; make one set a region, or give utm_east and utm_north"
         )
     phi, lam = np.radians(latitude), np.radians(offset)
     e = np.sqrt(FLATTENING * (2 - FLATTENING))

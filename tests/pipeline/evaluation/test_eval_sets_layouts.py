@@ -214,6 +214,21 @@ def test_what_is_neither_name_nor_path(tmp_path: Path) -> None:
         load_set(str(tmp_path / "empty"), config(tmp_path))
 
 
+def test_sets_are_read_without_torch(tmp_path: Path) -> None:
+    """Listing what is missing must not take the seconds that torch needs to load."""
+    import subprocess
+    import sys
+
+    code = "import sys; from pipeline.evaluation.datasets import available; available('.'); sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[3])
+
+
+def test_dots_in_folder_names_stay(tmp_path: Path) -> None:
+    touch(tmp_path / "city v1.2" / "database", DATABASE)
+    touch(tmp_path / "city v1.2" / "queries", QUERIES)
+    assert load_set(str(tmp_path / "city v1.2"), EvaluationConfig()).name == "city_v1.2"
+
+
 def test_available_tells_present_from_missing(tmp_path: Path) -> None:
     touch(tmp_path / "miniature" / "images" / "test" / "database", DATABASE)
     touch(tmp_path / "miniature" / "images" / "test" / "queries", QUERIES)

@@ -97,6 +97,8 @@ def test_a_malicious_file_is_refused_and_not_run(tmp_path: Path, where: str) -> 
         b"cos\nsystem\n(S'true'\ntR.",
         b"cnumpy.core.multiarray\nscalar\n.",
         b"c_codecs\nencode\n(Vabc\nVzlib_codec\ntR.",
+        b"c_codecs\nencode\n(dS'x'\nI1\nsb.",
+        b"cnumpy\nndarray\n(dS'x'\nI1\nsb.",
         b"Pid\n.",
         b"",
         b"\x80\x04",
