@@ -37,8 +37,10 @@ class GlobalBatchNorm2d(nn.BatchNorm2d):
             self.num_batches_tracked.add_(1)
         momentum = 0.1 if self.momentum is None else self.momentum
         if not is_distributed():
-            buffers = (self.running_mean, self.running_var) if update else (None, None)
-            return F.batch_norm(input, *buffers, self.weight, self.bias, True, momentum, self.eps)
+            mean, var = self.running_mean, self.running_var
+            if not update and mean is not None and var is not None:
+                mean, var = mean.clone(), var.clone()  # checkpoint wants the same tensors saved in both forwards
+            return F.batch_norm(input, mean, var, self.weight, self.bias, True, momentum, self.eps)
         output, mean, variance, count = _Normalise.apply(input, self.weight, self.bias, self.eps)
         if update and self.running_mean is not None and self.running_var is not None:
             with torch.no_grad():

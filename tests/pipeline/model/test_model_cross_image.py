@@ -1,0 +1,88 @@
+"""The cross-image encoder against `nn.TransformerEncoder`, in one process and over real gloo processes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from processes import run_ranks
+from torch import Tensor, nn
+
+from pipeline.config import CrossImageConfig
+from pipeline.distributed import rank_slice
+from pipeline.model.cross_image import CrossImageEncoder
+
+IMAGES, REGIONS, DIM = 12, 3, 16
+CONFIG = CrossImageConfig(layers=2, heads=4, feedforward=24, dropout=0.0)
+
+
+def problem() -> tuple[CrossImageEncoder, Tensor, Tensor]:
+    """An encoder whose every parameter matters, regions [B, R, D], and the weights of a sum as the loss."""
+    torch.manual_seed(4)
+    encoder = CrossImageEncoder(DIM, CONFIG).double()
+    for parameter in encoder.parameters():
+        nn.init.normal_(parameter, std=0.3)
+    regions, towards = torch.randn(2, IMAGES, REGIONS, DIM, dtype=torch.float64)
+    return encoder, regions, towards
+
+
+def results(module: nn.Module, regions: Tensor, towards: Tensor, images_first: bool = True) -> dict[str, Tensor]:
+    regions = regions.clone().requires_grad_()
+    out = module(regions)
+    (out * towards).sum().backward()
+    assert regions.grad is not None
+    found = {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
+    return {"out": out.detach(), "regions": regions.grad, **found}
+
+
+def library_results() -> dict[str, Tensor]:
+    """torch's own encoder: images are the sequence, regions the batch, which is [B, R, D] with batch_first=False."""
+    encoder, regions, towards = problem()
+    layer = nn.TransformerEncoderLayer(DIM, CONFIG.heads, CONFIG.feedforward, 0.0, "gelu", batch_first=False)
+    library = nn.TransformerEncoder(layer, CONFIG.layers, enable_nested_tensor=False).double()
+    library.load_state_dict(encoder.state_dict())
+    return results(library, regions, towards)
+
+
+def on_a_rank() -> dict[str, Tensor]:
+    encoder, regions, towards = problem()
+    mine = rank_slice(IMAGES)
+    return results(encoder.train(), regions[mine], towards[mine])
+
+
+@pytest.mark.parametrize("world", [1, 2, 3])
+def test_training_attends_to_the_global_batch(world: int) -> None:
+    truth = library_results()
+    ranks = [on_a_rank()] if world == 1 else run_ranks(on_a_rank, world)
+    for name, theirs in truth.items():
+        parts = [r[name] for r in ranks]
+        # activations: the ranks' rows side by side; parameters: each rank's part of the gradient of the sum
+        ours = torch.cat(parts) if name in ("out", "regions") else torch.stack(parts).sum(0)
+        assert torch.allclose(ours, theirs, rtol=1e-10, atol=1e-12), name
+
+
+def evaluated_on_a_rank() -> Tensor:
+    encoder, regions, _ = problem()
+    with torch.no_grad():
+        return encoder.eval()(regions[rank_slice(IMAGES)])
+
+
+def test_evaluation_keeps_to_its_own_group() -> None:
+    encoder, regions, _ = problem()
+    for r, ours in enumerate(run_ranks(evaluated_on_a_rank, 2)):
+        with torch.no_grad():
+            alone = encoder.eval()(regions[rank_slice(IMAGES, r, 2)])
+        assert torch.allclose(ours, alone, atol=1e-13)
+
+
+def test_dropout_acts_in_training_only() -> None:
+    torch.manual_seed(0)
+    encoder = CrossImageEncoder(DIM, CrossImageConfig(layers=1, heads=4, feedforward=24, dropout=0.5))
+    regions = torch.randn(IMAGES, REGIONS, DIM)
+    assert not torch.equal(encoder(regions), encoder(regions))
+    encoder.eval()
+    assert torch.equal(encoder(regions), encoder(regions))
+
+
+def test_no_layers_change_nothing() -> None:
+    regions = torch.randn(2, REGIONS, DIM)
+    assert torch.equal(CrossImageEncoder(DIM, CrossImageConfig(layers=0))(regions), regions)
