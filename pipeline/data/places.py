@@ -213,6 +213,10 @@ class PlaceLoader:
                 yield batch
                 if ahead is not None:
                     ahead.advance(step + 1)
+        except RuntimeError as error:
+            if "worker" in str(error):  # torch only says that a process went away
+                error.add_note("a decoding process died: out of memory, or /dev/shm is full? Lower data.workers.")
+            raise
         finally:
             self.dataset.close()
             if ahead is not None:

@@ -10,19 +10,30 @@ from __future__ import annotations
 
 import multiprocessing
 import multiprocessing.forkserver
+import multiprocessing.resource_tracker
 import os
 import signal
 import threading
 from multiprocessing.context import BaseContext
 
-PRELOAD = "pipeline.data.preload"
+SCHEDULERS = {signal.SIGTERM, signal.SIGUSR1}  # what a scheduler sends to all processes of a job
 
 
 def context() -> BaseContext:
-    """The start method: a fork server that has this package and torch loaded once for all workers and epochs."""
+    """The start method: a fork server that has this package and torch loaded once for all workers and epochs.
+
+    The server and Python's resource tracker start with the schedulers' signals blocked, which their children inherit:
+    none is lost, since the trainer's own mask is as before afterwards.
+    """
     forkserver = multiprocessing.get_context("forkserver")
-    forkserver.set_forkserver_preload([PRELOAD])
-    multiprocessing.forkserver.ensure_running()  # it loads torch while the trainer builds its model
+    forkserver.set_forkserver_preload(["pipeline.data.places"])
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SCHEDULERS)
+    try:
+        multiprocessing.resource_tracker.ensure_running()  # leaves SIGTERM unblocked
+        signal.pthread_sigmask(signal.SIG_BLOCK, SCHEDULERS)
+        multiprocessing.forkserver.ensure_running()  # it loads torch while the trainer builds its model
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return forkserver
 
 
@@ -31,9 +42,8 @@ def start_worker(_: int) -> None:
     import torch
 
     torch.set_num_threads(1)
-    # blocked in all threads, so that the guard alone receives it and can see who sent it
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+    # blocked in all threads, so that the guard alone receives them and can see who sent them
+    signal.pthread_sigmask(signal.SIG_BLOCK, SCHEDULERS)
     threading.Thread(target=_guard, name="guard", daemon=True).start()
 
 
@@ -41,7 +51,7 @@ def _guard() -> None:
     trainer = multiprocessing.parent_process()
     assert trainer is not None  # a worker is always started by one
     while trainer.is_alive():
-        received = signal.sigtimedwait({signal.SIGTERM}, 1.0)
-        if received is not None and received.si_pid == trainer.pid:
+        received = signal.sigtimedwait(SCHEDULERS, 1.0)
+        if received is not None and (received.si_signo, received.si_pid) == (signal.SIGTERM, trainer.pid):
             break
     os._exit(0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import multiprocessing
 import os
 import pickle
 import signal
@@ -122,19 +123,31 @@ def test_missing_and_truncated_shards_are_named(make_set: Make, tmp_path: Path) 
         list(build_loader(index, config, 0, 0, 0, 0, 1))
 
 
+def test_a_killed_worker_is_told_and_not_waited_for(small_set: ShardIndex) -> None:
+    config = dataclasses.replace(CONFIG, workers=1, prefetch=1)
+    iterator = iter(build_loader(small_set, config, 0, 0, 0, 0, 1))
+    next(iterator)
+    (worker,) = multiprocessing.active_children()
+    worker.kill()
+    with pytest.raises(RuntimeError, match="exited unexpectedly") as caught:
+        list(iterator)
+    assert "Lower data.workers" in caught.value.__notes__[0]
+
+
 def test_descriptors_are_closed_and_never_pickled(small_set: ShardIndex) -> None:
     def opened() -> int:
-        return len(list(Path("/proc/self/fd").iterdir()))
+        """Descriptors of this process that are shards of the set."""
+        return sum(os.path.realpath(fd).startswith(small_set.root) for fd in Path("/proc/self/fd").iterdir())
 
-    before = opened()
+    assert opened() == 0
     loader = build_loader(small_set, CONFIG, 0, 0, 0, 0, 1)
     next(iterator := iter(loader))
-    assert opened() > before
+    assert opened() > 0
     copy: Places = pickle.loads(pickle.dumps(loader.dataset))
     assert equal_batches(copy.batch([0, 1]), loader.dataset.batch([0, 1]))
     copy.close()
     iterator.close()  # type: ignore[attr-defined]
-    assert opened() == before
+    assert opened() == 0
 
 
 def equal_batches(a: Batch, b: Batch) -> bool:

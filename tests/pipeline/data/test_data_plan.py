@@ -59,6 +59,7 @@ def test_each_place_at_most_once_and_only_the_tail_is_left(
         assert (joined == planned.batches[step]).all()
 
 
+@pytest.mark.filterwarnings("ignore:This DataLoader will create")
 @settings(max_examples=60, deadline=None)
 @given(any_cities, st.integers(1, 12), any_order, st.integers(0, 4), st.integers(0, 3), st.data())
 def test_a_cursor_resumes_with_exactly_the_rest(
