@@ -63,7 +63,6 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
 
     device, first = accelerator.device, accelerator.is_main_process  # type: ignore[attr-defined]
     file = checkpoint_file(job.checkpoint)
-    model = load_published(file).to(device) if file.suffix == ".pth" else load_model(file, device)
     names = config.sets or tuple(a.name for a in available(config.root, config.split) if a.folder is not None)
     sets, left_out = [], []
     for name in names:
@@ -75,6 +74,7 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
         raise DataError("; ".join(left_out) or f"no evaluation set under {config.root}/: give --sets or --root")
     for line in left_out if first else ():
         print(f"left out: {line}", file=sys.stderr)
+    model = load_published(file).to(device) if file.suffix == ".pth" else load_model(file, device)
     runs = [parent.parent for parent in file.parents if parent.name == "checkpoints"]
     output = Path(job.output) if job.output else (runs[0] if runs else file.parent) / "evaluation"
     fingerprint = model_fingerprint(model)

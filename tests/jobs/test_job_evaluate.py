@@ -1,0 +1,101 @@
+"""`jobs.evaluate` as a person starts it: one process, two processes, and what it says when something is missing."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from PIL import Image
+
+from jobs.evaluate import listed
+from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, PoolingConfig
+from pipeline.model.vpr import build_model
+from pipeline.model.weights import save_model
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with a small random model, and a set of nine photos an aisle with `@utm` names."""
+    folder = tmp_path_factory.mktemp("house")
+    config = ModelConfig(
+        backbone=BackboneConfig(name="custom", dim=16, depth=1, heads=2, patch=14, pretrain_grid=4),
+        adapter=AdapterConfig(reduced=2),
+        pooling=PoolingConfig(levels=(1, 2)),
+        cross_image=CrossImageConfig(layers=1, heads=2, feedforward=16),
+    )
+    torch.manual_seed(0)
+    best = folder / "run" / "checkpoints" / "best"
+    best.mkdir(parents=True)
+    save_model(build_model(config, 56), best / "model.safetensors", config, 56, everything=True)
+    rng = np.random.Generator(np.random.PCG64(0))
+    for split in ("test", "train"):
+        for i in range(21):
+            field = rng.integers(0, 256, (5, 5, 3))
+            for side, noise in (("database", 0), ("queries", 25)):
+                if side == "queries" and i >= 9:
+                    continue
+                image = (field + noise * rng.normal(size=field.shape)).clip(0, 255).astype(np.uint8)
+                path = folder / f"data/aisle/images/{split}/{side}/@{500000 + 100 * i:010.2f}@{4000000:010.2f}@@.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                Image.fromarray(image).resize((60, 50), Image.Resampling.BICUBIC).save(path)
+    return folder
+
+
+def start(folder: Path, *options: str, processes: int = 1) -> subprocess.CompletedProcess[str]:
+    launcher = ["-m", "torch.distributed.run", "--nproc_per_node", str(processes)] if processes > 1 else []
+    command = [sys.executable, *launcher, "-m", "jobs.evaluate", "--root", str(folder / "data"), "--workers", "0"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "1"}
+    return subprocess.run([*command, *options], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=240)
+
+
+def test_one_process_and_two_write_the_same_figures(run_folder: Path) -> None:
+    common = ("--checkpoint", str(run_folder / "run"), "--group-size", "4", "--recalls", "1,5")
+    alone = start(
+        run_folder, *common, "--sets", "aisle,pitts30k", "--pca", "6", "--pca-from", "aisle", "--store", "fp32"
+    )
+    assert alone.returncode == 0, alone.stderr
+    assert "left out: pitts30k" in alone.stderr
+    assert all(name in alone.stdout for name in ("single_pca6", "shuffled4_pca6", "ordered4_pca6", "report.html"))
+    out = run_folder / "run" / "evaluation"
+    results = json.loads((out / "results.json").read_text())
+    assert [r["database"] for r in results["results"]] == [21] * 3 and results["left_out"][0].startswith("pitts30k")
+    assert results["model"]["backbone"]["dim"] == 16 and len(results["fingerprint"]) == 16
+    assert (out / "report.html").stat().st_size > 50_000 and (out / "figures" / "aisle.curves.png").is_file()
+    assert (out / "descriptors/aisle/single/database/part-00000.parquet").is_file()
+    kept = sorted((run_folder / "run/checkpoints/best").glob("pca-6.aisle.*.safetensors"))
+    assert len(kept) == 3
+    changed = [f.stat().st_mtime_ns for f in kept]
+
+    options = ("--pca", "6", "--pca-from", "aisle", "--output", str(run_folder / "two"), "--figures", "false")
+    two = start(run_folder, *common, "--sets", "aisle", *options, processes=2)
+    assert two.returncode == 0, two.stderr
+    assert [f.stat().st_mtime_ns for f in kept] == changed  # read, not fitted again
+    again = json.loads((run_folder / "two" / "results.json").read_text())["results"]
+    assert [r["recalls"] for r in again] == [r["recalls"] for r in results["results"]]
+    for file in (out / "predictions").glob("*.parquet"):
+        mine, theirs = pq.read_table(file), pq.read_table(run_folder / "two" / "predictions" / file.name)
+        assert mine["rows"] == theirs["rows"]
+        near = np.array(mine["distances"].to_pylist()), np.array(theirs["distances"].to_pylist())
+        np.testing.assert_allclose(*near, atol=1e-5)  # a store hands over other blocks, so sums round otherwise
+
+
+def test_what_is_missing_is_said_in_one_line(run_folder: Path) -> None:
+    nothing = start(run_folder, "--checkpoint", str(run_folder / "run"), "--sets", "pitts30k")
+    assert nothing.returncode == 3 and "pitts30k is not there" in nothing.stderr
+    assert "Traceback" not in nothing.stderr
+    unnamed = start(run_folder)
+    assert unnamed.returncode == 2 and "--checkpoint is missing" in unnamed.stderr
+
+
+def test_lists_may_be_written_plainly() -> None:
+    assert listed(["--sets", "a,b:c->d", "--recalls", "1,5"]) == ["--sets", '["a", "b:c->d"]', "--recalls", "[1, 5]"]
+    assert listed(["--sets", "[a]", "--pca", "512"]) == ["--sets", "[a]", "--pca", "512"]

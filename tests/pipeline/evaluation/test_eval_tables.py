@@ -1,0 +1,151 @@
+"""Tables, files and pictures of results, read back and looked into."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.config import EvaluationConfig
+from pipeline.evaluation import figures, report, tables
+from pipeline.evaluation.evaluate import Result, score
+from pipeline.evaluation.evaluation_set import EvaluationSet
+from pipeline.evaluation.predictions import load_predictions, save_predictions
+from pipeline.evaluation.protocol import protocols
+from pipeline.evaluation.recall import recall_at
+from shards.errors import DataError
+
+CONFIG = EvaluationConfig(recalls=(1, 5, 10), group_size=8)
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> EvaluationSet:
+    folder = tmp_path_factory.mktemp("street")
+    rng = np.random.Generator(np.random.PCG64(0))
+
+    def photo(name: str, size: tuple[int, int]) -> Path:
+        path = folder / name
+        Image.fromarray(rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)).save(path)
+        return path
+
+    return EvaluationSet(
+        "pitts30k",
+        [photo(f"d{i:02d}.jpg", (40, 30)) for i in range(30)],
+        [photo(f"q{i:02d}.jpg", (30, 40) if i % 3 else (48, 27)) for i in range(12)],
+        [np.array([2 * i, 2 * i + 1], np.int64) if i < 11 else np.empty(0, np.int64) for i in range(12)],
+        "25 m",
+        np.stack([np.arange(30) * 12.0, np.arange(30) % 7 * 30.0], 1),
+        np.stack([np.arange(12) * 24.0, np.arange(12) % 7 * 28.0], 1),
+    )
+
+
+def results_of(evaluated: EvaluationSet, config: EvaluationConfig = CONFIG) -> list[Result]:
+    made = []
+    for number, protocol in enumerate(protocols(config, 224, evaluated.rule)):
+        rng = np.random.Generator(np.random.PCG64(number))
+        predictions = np.stack([rng.permutation(30)[:10] for _ in range(12)])
+        predictions[:5, 0] = 2 * np.arange(5)  # right at first
+        distances = np.sort(rng.random((12, 10)).astype(np.float32), axis=1)
+        made.append(score(evaluated, protocol, config, predictions, distances))
+    return made
+
+
+def test_the_table_has_all_groupings_together_and_the_paper_beside(street: EvaluationSet) -> None:
+    other = dataclasses.replace(street, name="elsewhere")
+    text = tables.terminal(results_of(street) + results_of(other))
+    lines = text.splitlines()
+    assert [line.split()[0] for line in lines[2:5]] == ["pitts30k", "shuffled8", "ordered8"]
+    assert lines[2].endswith("91.6 / 95.7 / 96.9")  # the paper, each image alone
+    assert lines[4].endswith("94.8 / 97.4 / 98.1")  # the paper, 8 neighbours, no PCA
+    assert lines[3].endswith(" -") and max(map(len, lines[:9])) < 120
+    assert "1 queries have no positive and are counted as misses" in text
+    assert "8 neighbours in file order" in text
+
+
+def test_a_set_without_a_matching_protocol_shows_the_headline_in_its_own_row(street: EvaluationSet) -> None:
+    table = tables.rows(results_of(street, dataclasses.replace(CONFIG, groups=("shuffled",))))
+    assert [row["protocol"] for row in table] == ["shuffled8", "paper: ordered8, PCA 4096"]
+    assert table[1]["R@1"] == "94.9"
+
+
+def test_files_say_the_same(street: EvaluationSet, tmp_path: Path) -> None:
+    results = results_of(street)
+    tables.write_json(results, tmp_path / "results.json", {"checkpoint": "x"})
+    plain = tables.read_json(tmp_path / "results.json")
+    first = plain["results"][0]
+    assert plain["checkpoint"] == "x" and first["protocol"]["groups"] == "single"
+    assert first["metrics"] == {f"pitts30k.single.recall_at_{k}": v for k, v in results[0].recalls.items()}
+    tables.write_csv(results, tmp_path / "results.csv")
+    with (tmp_path / "results.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 9 and float(lines[1]["recall"]) == results[0].recalls[5] and lines[0]["rule"] == "25 m"
+    assert tables.markdown(results).count("\n|") == 4
+    (tmp_path / "other.json").write_text("{}")
+    with pytest.raises(DataError, match="format"):
+        tables.read_json(tmp_path / "other.json")
+
+
+def test_predictions_come_back_and_give_the_same_recall(street: EvaluationSet, tmp_path: Path) -> None:
+    for result in results_of(street):
+        kept = load_predictions(save_predictions(result, street, tmp_path))
+        assert kept.protocol == result.protocol and kept.queries == [str(q) for q in street.queries]
+        assert (kept.rows == result.predictions).all() and (kept.distances == result.distances).all()
+        assert recall_at(kept.rows, kept.positives, CONFIG.recalls) == result.recalls
+        curve = figures.curve_of(street, result)
+        assert [curve[k - 1] for k in CONFIG.recalls] == pytest.approx(list(result.recalls.values()))
+    with pytest.raises(DataError, match="predictions"):
+        load_predictions(Path(__file__))
+
+
+def test_examples_are_of_their_kind(street: EvaluationSet) -> None:
+    result = results_of(street)[0]
+    right = {q for q in range(12) if result.predictions[q, 0] in street.positives[q]}
+    assert right >= set(range(5)) and set(figures.choose(street, result, "correct", 12)) == right
+    assert set(figures.choose(street, result, "failures", 12)) == set(range(11)) - right  # query 11 has no positive
+    metres = figures.errors_in_metres(street, result)
+    worst = figures.choose(street, result, "worst")
+    assert metres is not None and worst and list(metres[worst]) == sorted(metres[worst], reverse=True)
+    assert not any(np.isin(result.predictions[q], street.positives[q]).any() for q in worst)
+
+
+def colour_share(path: Path, colour: str) -> float:
+    """Share of a picture's pixels near a colour."""
+    wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
+    pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    return float((np.abs(pixels - wanted).max(axis=-1) < 14).mean())
+
+
+def test_frames_are_green_where_right_and_red_where_wrong(street: EvaluationSet, tmp_path: Path) -> None:
+    result = results_of(street)[0]
+    right, wrong = np.array([[2, 3], [4, 5]]), np.array([[20, 21], [22, 23]])
+    for name, answers in (("right", right), ("wrong", wrong)):
+        drawn = dataclasses.replace(result, predictions=answers, distances=np.ones((2, 2), np.float32))
+        asked = dataclasses.replace(street, queries=street.queries[1:3], positives=street.positives[1:3],
+                                    query_positions=None)  # fmt: skip
+        figures.retrieval_grid(asked, drawn, [0, 1], tmp_path / f"{name}.png", name)
+    assert colour_share(tmp_path / "right.png", figures.GREEN) > 0.01
+    assert colour_share(tmp_path / "right.png", figures.RED) < 0.0005
+    assert colour_share(tmp_path / "wrong.png", figures.RED) > 0.01
+    assert colour_share(tmp_path / "wrong.png", figures.BLUE) > 0.004  # the positive that was missed
+    assert colour_share(tmp_path / "wrong.png", figures.GREEN) < 0.0005
+
+
+def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
+    config = dataclasses.replace(CONFIG, groups=("single",))
+    sequence = dataclasses.replace(street, name="seq", database_positions=None, query_positions=None, rule="+-2 frames")
+    unscored = dataclasses.replace(street, name="unknown", has_ground_truth=False)
+    sets = [street, sequence, unscored]
+    results = [result for evaluated in sets for result in results_of(evaluated, config)]
+    assert results[2].recalls == {}
+    pictures = report.draw(results, sets, tmp_path / "figures")
+    assert {p.path.name for p in pictures} >= {"pitts30k.curves.png", "seq.single.errors.png", "seq.single.worst.jpg"}
+    report.write_report(results, pictures, tmp_path / "report.html", "A <test>", {"checkpoint": "a&b"})
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("<img") == len(pictures) == page.count("base64,")
+    assert not re.search(r'(?:src|href)="(?!data:|#)', page) and "<script" not in page and "url(" not in page
+    assert "A &lt;test&gt;" in page and "a&amp;b" in page and "each image alone" in page
