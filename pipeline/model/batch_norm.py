@@ -68,7 +68,7 @@ class _Normalise(torch.autograd.Function):
         wide = x if x.dtype == torch.float64 else x.float()
         channels, own = x.shape[1], x.numel() // x.shape[1]
         variance, mean = torch.var_mean(wide, dim=(0, 2, 3), correction=0)
-        ranks = gather(torch.cat((mean, variance * own, mean.new_tensor([own])))[None])  # [W, 2C + 1]
+        ranks = gather(torch.cat((mean, variance * own, mean.new_full((1,), own)))[None])  # [W, 2C + 1]
         counts = ranks[:, -1:]
         count = counts.sum()
         means = ranks[:, :channels]

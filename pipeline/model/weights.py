@@ -28,13 +28,16 @@ FORMAT = "place-model 1"
 PUBLISHED_SIZE = 224
 
 
-def from_published(state_dict: Mapping[str, Any], source: str = "the state dict") -> PlaceModel:
+def from_published(
+    state_dict: Mapping[str, Any], source: str = "the state dict", image_size: int = PUBLISHED_SIZE
+) -> PlaceModel:
     """The paper's model from a released CricaVPR state dict, in eval mode.
 
     Args:
         state_dict: its 668 tensors, with or without the `module.` prefix, also inside the published trainer's
             checkpoint (`model_state_dict`). float64 tensors stay float64, all others become float32.
         source: what an error message calls it.
+        image_size: side of the input in pixels; the position embedding is resized to it.
 
     Raises:
         UsageError: missing or surplus names, or other shapes.
@@ -43,7 +46,7 @@ def from_published(state_dict: Mapping[str, Any], source: str = "the state dict"
         name: t if t.dtype == torch.float64 or not t.is_floating_point() else t.float()
         for name, t in unwrap(state_dict, source).items()
     }
-    model = _without_weights(ModelConfig(), PUBLISHED_SIZE)
+    model = _without_weights(ModelConfig(), image_size)
     fit(model, given, source, assign=True)
     return model.eval()
 

@@ -70,8 +70,8 @@ def test_released_backbones_load(
     loaded = to_published({f"backbone.{n}": t for n, t in model.backbone.state_dict().items()})
     for name, tensor in small_release.items():
         assert torch.equal(loaded[f"backbone.{name}"], tensor), name
-    query = next(t for n, t in model.state_dict().items() if n.endswith("layer.1.attention.q_proj.weight"))
-    assert torch.equal(query, small_release["blocks.1.attn.qkv.weight"][:32])
+    query = layout(model.state_dict())["backbone.blocks.1.attn.qkv.weight"][0]
+    assert torch.equal(model.state_dict()[query], small_release["blocks.1.attn.qkv.weight"][:32])
     assert frozen_hash(model) == frozen_hash(build_model(with_weights(small, path), SIZE))
 
 
@@ -158,6 +158,12 @@ def test_wrong_weights_are_one_clear_line(tmp_path: Path, small: ModelConfig, sm
         assert name in str(caught.value) and "\n" not in str(caught.value)
     with pytest.raises(UsageError, match=r"holds no model\.safetensors"):
         build_model(with_weights(small, tmp_path), SIZE)
+
+
+def test_published_weights_load_at_another_input_size(published_state: dict[str, Tensor]) -> None:
+    model = from_published(published_state, image_size=322)
+    assert model.backbone.vit.embeddings.resized.shape == (1, 1 + 23 * 23, 768)
+    assert model.pooling.members.sum(1).tolist()[:4] == [144, 132, 132, 121]  # 12|11 in both directions
 
 
 def test_published_weights_that_do_not_fit_are_one_clear_line() -> None:
