@@ -15,10 +15,12 @@ from shards.miniature.place import Place
 from shards.miniature.weather import Conditions
 
 
-@lru_cache(maxsize=1)
-def _radial() -> Image.Image:
+@lru_cache(maxsize=8)
+def _lamplight(power: float) -> Image.Image:
+    """A 64 x 64 disc of warm light, fading outwards."""
     y, x = np.mgrid[-1:1:64j, -1:1:64j]
-    return Image.fromarray((np.clip(1 - np.hypot(x, y), 0, 1) ** 1.6 * 255).astype(np.uint8))
+    fall = np.clip(1 - np.hypot(x, y), 0, 1)[..., None] ** 1.6
+    return Image.fromarray((fall * 255 * power * np.array([1.0, 0.8, 0.5])).astype(np.uint8))
 
 
 class Atmosphere:
@@ -56,8 +58,8 @@ class Atmosphere:
         part = (
             (box[0] - whole[0]) * sx, (box[1] - whole[1]) * sy, (box[2] - whole[0]) * sx, (box[3] - whole[1]) * sy,
         )  # fmt: skip
-        light = _radial().resize((box[2] - box[0], box[3] - box[1]), Image.Resampling.BILINEAR, box=part)
-        warm = Image.merge("RGB", [light.point([int(i * power * c) for i in range(256)]) for c in (1.0, 0.8, 0.5)])
+        target = (box[2] - box[0], box[3] - box[1])
+        warm = _lamplight(power).resize(target, Image.Resampling.BILINEAR, box=part)
         under = self.canvas.crop(box)
         extra = ImageChops.multiply(under, warm)
         self.canvas.paste(ImageChops.add(ImageChops.add(under, extra), extra), box)

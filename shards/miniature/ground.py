@@ -24,7 +24,7 @@ UP = np.array([0.0, 1.0, 0.0])
 
 @lru_cache(maxsize=4)
 def gravel(width: int, height: int) -> Image.Image:
-    """Grain of the ground, finer towards the top (the horizon)."""
+    """RGB grain of the ground, finer towards the top (the horizon)."""
     rng = np.random.default_rng(5)
     out = Image.new("L", (width, height), 250)
     rows = max(height // 12, 1)
@@ -32,7 +32,7 @@ def gravel(width: int, height: int) -> Image.Image:
         cells = (max(width // (1 + k // 2), 2), max(rows // (1 + k // 4), 1))
         tile = Image.fromarray(rng.normal(242, 7, (cells[1], cells[0])).clip(0, 255).astype(np.uint8))
         out.paste(tile.resize((width, rows + 1), Image.Resampling.BILINEAR), (0, k * rows))
-    return out
+    return Image.merge("RGB", (out, out, out))
 
 
 def hull(points: list[tuple[float, float]]) -> Array:
@@ -109,8 +109,8 @@ class Ground:
                     self._patch([(x, z), (x + 3, z), (x + 3, z + 0.5), (x, z + 0.5)], marking, 9)
         top = max(int(self.camera.horizon) - 2, 0)
         box = (0, top, self.camera.width, self.camera.height)
-        grain = gravel(self.camera.width, self.camera.height - top)
-        self.canvas.paste(ImageChops.multiply(self.canvas.crop(box), Image.merge("RGB", (grain, grain, grain))), box)
+        grain = gravel(self.camera.width, self.camera.height // 2).crop((0, 0, box[2], box[3] - top))
+        self.canvas.paste(ImageChops.multiply(self.canvas.crop(box), grain), box)
 
     def shadows(self) -> None:
         """What the sun's rays do not reach on the ground."""

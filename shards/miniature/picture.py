@@ -5,8 +5,8 @@ Invariant: what stays the same over the photos of a `Studio` is the place; every
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -21,9 +21,11 @@ from shards.miniature.painter import PX, Wall
 from shards.miniature.place import Building, make_place
 from shards.miniature.roof import cover, slopes, stacks
 from shards.miniature.scenery import Scenery
+from shards.miniature.sight import in_sight
 from shards.miniature.weather import Conditions
 
 OVERSAMPLE = 1.25
+SLIVER = 6  # pixels of the canvas
 Step = tuple[float, Callable[[], None]]
 
 
@@ -55,12 +57,8 @@ class Studio:
         ground.draw()
         ground.shadows()
         steps: list[Step] = scene.things() + scene.traffic()
-        for building in self.place.buildings:
-            x = min(max(camera.x, building.x0), building.x1)
-            z = min(max(camera.z, building.z0), building.z1)
-            if max(camera.depth(a, b) for a in (building.x0, building.x1) for b in (building.z0, building.z1)) > 1:
-                distance = math.hypot(x - camera.x, z - camera.z)
-                steps.append((distance + 0.5, lambda b=building, d=distance: self._build(canvas, camera, photo, b, d)))  # type: ignore[misc]
+        for distance, house in in_sight(camera, self.place.buildings):
+            steps.append((distance + 0.5, partial(self._build, canvas, camera, photo, house, distance)))
         for _, step in sorted(steps, key=lambda item: -item[0]):
             step()
         above = Atmosphere(canvas, camera, self.place, photo.conditions)
@@ -91,9 +89,16 @@ class Studio:
             if surface.faces(camera):
                 self._roof(canvas, camera, photo.conditions, b, surface, distance)
         for number, (name, plane) in enumerate(faces.items()):
-            if not plane.faces(camera) or not camera.polygon(plane.corners):
+            edge = camera.polygon(plane.corners) if plane.faces(camera) else []
+            if not edge:
                 continue
             full = name in b.fronts
+            us = [u for u, _ in edge]
+            if max(us) - min(us) < SLIVER:  # too thin to show a window
+                paint = [int(v) for v in np.mean(b.family.walls, axis=0) * 0.85]
+                fill = photo.conditions.shade(paint, photo.conditions.light(plane.normal), distance)
+                ImageDraw.Draw(canvas).polygon(edge, fill=fill)
+                continue
             wall = self._wall(number, b, full, wide if name == "south" else deep)
             if wall.height > up:  # the gable rises above the eaves
                 extra = wall.height - up
@@ -132,6 +137,14 @@ class Studio:
 
     def _roof(self, canvas: Image.Image, camera: Camera, sky: Conditions, b: Building, s: Surface, d: float) -> None:
         colour = (236, 240, 246) if sky.snow else b.family.roof_colour
+        outline = camera.polygon(s.corners)
+        if not outline:
+            return
+        us, vs = [u for u, _ in outline], [v for _, v in outline]
+        if (b.family.roof != "mansard" and d > 14) or min(max(us) - min(us), max(vs) - min(vs)) < SLIVER:
+            # tiles do not show at this distance
+            ImageDraw.Draw(canvas).polygon(outline, fill=sky.shade([c * 0.94 for c in colour], sky.light(s.normal), d))
+            return
         wide, deep = float(np.linalg.norm(np.array(s.right))), float(np.linalg.norm(np.array(s.down)))
         base = cover(b, colour, wide, deep, sky.snow)
         lay(canvas, camera, s, sky.relight(base, sky.light(s.normal), d), None)
