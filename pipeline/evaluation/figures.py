@@ -215,24 +215,28 @@ def _order_plot(evaluated: EvaluationSet, result: Result, right: np.ndarray, pat
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, handletextpad=0.3)
 
 
-def attention_overlay(model: Any, photos: Sequence[Path], path: Path, title: str) -> None:
-    """Photos above the channel mean of their patch tokens (paper, Fig. 1), each map scaled to its own range.
+def attention_maps(model: Any, photos: Sequence[Path]) -> np.ndarray:
+    """Channel means of the patch tokens of photos (paper, Fig. 1): float32 [n, G, G].
 
     `model.backbone(images [n, 3, S, S]) -> [n, 1 + G*G, D]`, in eval mode, on any device.
     """
     import torch
 
-    size, device = int(model.image_size), next(model.parameters()).device
-    inputs = torch.stack([to_input(load_image(photo), size) for photo in photos])
+    inputs = torch.stack([to_input(load_image(photo), int(model.image_size)) for photo in photos])
     with torch.no_grad():
-        tokens = model.backbone(normalise(inputs.to(device))).float().cpu()
+        tokens = model.backbone(normalise(inputs.to(next(model.parameters()).device))).float().cpu()
     side = math.isqrt(tokens.shape[1] - 1)
-    maps = tokens[:, 1:].mean(-1).reshape(-1, side, side).numpy()
+    return np.asarray(tokens[:, 1:].mean(-1).reshape(-1, side, side).numpy())
+
+
+def attention_overlay(model: Any, photos: Sequence[Path], path: Path, title: str) -> None:
+    """Photos above their `attention_maps`, each map scaled to its own range."""
+    maps, size = attention_maps(model, photos), int(model.image_size)
     with _canvas(2.0 * len(photos), 4.9, path) as figure:
         figure.suptitle(title, x=0.008, ha="left", fontsize=13, fontweight="bold")
         axes = figure.subplots(2, len(photos), squeeze=False)
         for i, photo in enumerate(photos):
-            pixels = inputs[i].permute(1, 2, 0).numpy()
+            pixels = to_input(load_image(photo), size).permute(1, 2, 0).numpy()
             axes[0, i].imshow(pixels)
             axes[0, i].set_title(_short(photo), fontsize=8, fontweight="normal", loc="center")
             axes[1, i].imshow(pixels)

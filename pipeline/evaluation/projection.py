@@ -25,7 +25,7 @@ from pipeline.evaluation.retrieval import Blocks
 from shards.errors import DataError, UsageError
 
 SAMPLE = 16_384  # rows at most that PCA is fitted on (published: the same)
-DOUBLE = 4_096  # dimensions up to which the arithmetic is float64
+DOUBLE = 1_024  # dimensions up to which the arithmetic is float64
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.evaluate import Result, evaluate, fit_projections
 from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.protocol import protocols
+from pipeline.evaluation.stored import evaluate_stores
 from shards.errors import DataError
 
 
@@ -146,6 +147,37 @@ def test_store_is_reused_and_gives_the_same_results(tmp_path: Path) -> None:
     changed = evaluate(model, [evaluated], config, "cpu", output=out, progress=False)
     fresh = evaluate(model, [evaluated], CONFIG, "cpu", progress=False)
     assert all((a.predictions == b.predictions).all() for a, b in zip(changed, fresh, strict=True))
+
+
+def test_recalls_and_pca_tables_come_from_the_store_alone(tmp_path: Path) -> None:
+    """What the model gave with PCA in one go comes out of the store later, photographs gone."""
+    evaluated, model, out = make_set(tmp_path), Tiny(torch.float32), tmp_path / "out"
+    evaluate(model, [evaluated], dataclasses.replace(CONFIG, store="fp32"), "cpu", output=out, progress=False)
+    direct = {
+        dims: evaluate(model, [evaluated], dataclasses.replace(CONFIG, pca=dims), "cpu", progress=False)
+        for dims in (None, 6, 2)
+    }
+    for path in evaluated.database + evaluated.queries:
+        path.unlink()
+    table = evaluate_stores(out, [evaluated], CONFIG, (None, 6, 2))
+    assert len(table) == 9
+    for result in table:
+        truth = next(r for r in direct[result.protocol.pca] if r.protocol == result.protocol)
+        np.testing.assert_allclose(result.distances, truth.distances, atol=1e-5)
+        assert result.recalls == truth.recalls
+    assert len({r.recalls[1] for r in table if r.protocol.groups == "single"}) > 1  # dimensions cost something
+    fewer = dataclasses.replace(evaluated, database=evaluated.database[::-1])
+    with pytest.raises(DataError, match="other images"):
+        evaluate_stores(out, [fewer], CONFIG)
+    with pytest.raises(DataError, match="no descriptors of elsewhere"):
+        evaluate_stores(out, [dataclasses.replace(evaluated, name="elsewhere")], CONFIG)
+
+
+@pytest.mark.parametrize("search", ["hnsw", "ivfpq"])
+def test_an_approximate_search_says_how_well_it_agrees(tmp_path: Path, search: str) -> None:
+    config = dataclasses.replace(CONFIG, groups=("single",), search=search)  # type: ignore[arg-type]
+    result = evaluate(Tiny(), [make_set(tmp_path)], config, "cpu", progress=False)[0]
+    assert f"{search} finds " in result.remarks[0] and result.protocol.name == f"single_{search}"
 
 
 def run_rank(rank: int, world: int, folder: Path, evaluated: EvaluationSet, broken: bool) -> None:

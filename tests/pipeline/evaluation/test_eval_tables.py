@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from pipeline.config import EvaluationConfig
@@ -149,3 +150,23 @@ def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
     assert page.count("<img") == len(pictures) == page.count("base64,")
     assert not re.search(r'(?:src|href)="(?!data:|#)', page) and "<script" not in page and "url(" not in page
     assert "A &lt;test&gt;" in page and "a&amp;b" in page and "each image alone" in page
+
+
+def test_attention_lies_where_the_tokens_are_large(street: EvaluationSet, tmp_path: Path) -> None:
+    class Corner(torch.nn.Module):
+        """Tokens of a 4 x 4 grid, large in the first cell of the second row alone."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.image_size, self.weight = 32, torch.nn.Parameter(torch.zeros(1))
+
+        def backbone(self, images: torch.Tensor) -> torch.Tensor:
+            tokens = torch.zeros(len(images), 17, 6)
+            tokens[:, 0] = 100  # the class token is no patch
+            tokens[:, 1 + 4] = 1
+            return tokens
+
+    maps = figures.attention_maps(Corner(), street.database[:2])
+    assert maps.shape == (2, 4, 4) and np.argwhere(maps[0]).tolist() == [[1, 0]]
+    figures.attention_overlay(Corner(), street.database[:2], tmp_path / "attention.png", "attention")
+    assert Image.open(tmp_path / "attention.png").size[0] > 300
