@@ -3,8 +3,7 @@
     python -m jobs.prepare --source DIR --out DIR --rounds 4
     python -m jobs.prepare --verify DIR
 
-Killed, it continues; done, it says so. Exit codes: 0 done, 2 usage, 3 too many bad images, or a set that is not as its
-manifest says.
+Killed, it continues; done, it says so. Exit codes: 0 done, 2 usage, 3 too many bad images or a damaged set.
 """
 
 from __future__ import annotations

@@ -85,8 +85,14 @@ def has_utm_names(root: Path) -> bool:
 
 
 def _pictures(root: Path) -> Iterator[tuple[str, int]]:
-    """(path from the root, bytes or -1) of every picture file, hidden ones excepted."""
-    for folder, below, names in os.walk(root):
+    """(path from the root, bytes or -1) of every picture file but hidden ones; linked folders are entered once."""
+    visited: set[tuple[int, int]] = set()
+    for folder, below, names in os.walk(root, followlinks=True):
+        at = os.stat(folder)  # noqa: PTH116
+        if (at.st_dev, at.st_ino) in visited:  # a link back up, or a second way to the same photos
+            below.clear()
+            continue
+        visited.add((at.st_dev, at.st_ino))
         below[:] = sorted(name for name in below if not name.startswith((".", "__MACOSX")))
         inside = Path(folder).relative_to(root).as_posix()
         for name in sorted(names):

@@ -34,6 +34,14 @@ def test_a_sub_folder_is_a_place(tmp_path: Path) -> None:
     assert found.table["lat"].null_count == 4
 
 
+def test_linked_folders_are_entered_once(tmp_path: Path) -> None:
+    put(tmp_path, "elsewhere/cafe/1.jpg", "mine/square/1.jpg")
+    (tmp_path / "mine" / "linked").symlink_to(tmp_path / "elsewhere" / "cafe")
+    (tmp_path / "mine" / "square" / "up").symlink_to(tmp_path / "mine")
+    (tmp_path / "mine" / "zz").symlink_to(tmp_path / "elsewhere" / "cafe")
+    assert read_source(tmp_path / "mine").table["path"].to_pylist() == ["linked/1.jpg", "square/1.jpg"]
+
+
 def test_pictures_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     put(tmp_path, "cafe/1.jpg", "loose.jpg", "cafe/2.heic")
     put(tmp_path, "cafe/0.jpg", data=b"")
