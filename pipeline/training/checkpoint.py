@@ -44,7 +44,6 @@ class RunState:
         cursor: global batches of that epoch already trained on.
         best: best validation figure so far, percent, and the step it belongs to.
         stale: epochs since then.
-        finished: why the run ended ("epochs", "steps", "patience"), or "".
         run_id: MLflow run, "" when not recorded.
         index: digest of the shard set's index.
         world_size: ranks that wrote it (informative; any number may continue).
@@ -59,7 +58,6 @@ class RunState:
     best: float | None = None
     best_step: int | None = None
     stale: int = 0
-    finished: str = ""
     run_id: str = ""
     index: str = ""
     world_size: int = 1

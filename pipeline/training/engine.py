@@ -89,9 +89,19 @@ class Engine:
         )
         return model, self._collect(moments)
 
-    def load(self, optimizer: dict[str, Tensor]) -> None:
-        """Puts whole optimiser tensors, as `state` gave them, where they belong. (The weights are loaded into the
-        model before it is wrapped.)"""
+    def scaler(self) -> dict[str, float]:
+        """The loss scaler's state under fp16, else {}."""
+        held = getattr(self.accelerator, "scaler", None)
+        return {} if held is None else {key: float(value) for key, value in held.state_dict().items()}
+
+    def load(self, optimizer: dict[str, Tensor], scaler: dict[str, float]) -> None:
+        """Puts whole optimiser tensors, as `state` gave them, and the loss scaler's state where they belong.
+
+        (The weights are loaded into the model before it is wrapped.)
+        """
+        if scaler and getattr(self.accelerator, "scaler", None) is not None:
+            whole = ("growth_interval", "_growth_tracker")
+            self.accelerator.scaler.load_state_dict({k: int(v) if k in whole else v for k, v in scaler.items()})
         inner = getattr(self.optimizer, "optimizer", self.optimizer)
         parameters = self.names()
         for key, value in optimizer.items():

@@ -12,6 +12,8 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -100,53 +102,61 @@ class Tracker:
         """Records metrics at a step, in the background."""
         if self._client is None:
             return
-        from mlflow.entities import Metric
+        with self._recording(f"metrics of step {step}"):
+            from mlflow.entities import Metric
 
-        now = int(time.time() * 1000)
-        entries = [Metric(name, float(value), now, step) for name, value in values.items()]
-        self._client.log_batch(self.run_id, metrics=entries, synchronous=False)
-
-    def tags(self, values: dict[str, str]) -> None:
-        """Sets tags of the run."""
-        for key, value in values.items() if self._client is not None else ():
-            self._client.set_tag(self.run_id, key, value)
+            now = int(time.time() * 1000)
+            entries = [Metric(name, float(value), now, step) for name, value in values.items()]
+            self._client.log_batch(self.run_id, metrics=entries, synchronous=False)
 
     def artifact(self, path: Path, folder: str | None = None) -> None:
         """Stores a file, or a folder's files, with the run."""
         if self._client is None:
             return
-        if path.is_dir():
-            self._client.log_artifacts(self.run_id, str(path), folder)
-        else:
-            self._client.log_artifact(self.run_id, str(path), folder)
+        with self._recording(f"artifact {path}"):
+            (self._client.log_artifacts if path.is_dir() else self._client.log_artifact)(self.run_id, str(path), folder)
 
     def checkpoint(self, path: Path, step: int, values: dict[str, float]) -> None:
         """Registers a checkpoint folder as a logged model of the run, ranked by its validation figures."""
         if self._client is None:
             return
-        from mlflow.entities import LoggedModelStatus, Metric
+        with self._recording(f"checkpoint of step {step}"):
+            from mlflow.entities import LoggedModelStatus, Metric
 
-        model = self._client.create_logged_model(
-            self._experiment,
-            name=f"{self.config.name}-step-{step}",
-            source_run_id=self.run_id,
-            tags={"checkpoint": str(path), "step": str(step)},
-            model_type="checkpoint",
-        )
-        now = int(time.time() * 1000)
-        entries = [Metric(k, float(v), now, step, model_id=model.model_id) for k, v in values.items()]
-        if entries:
-            self._client.log_batch(self.run_id, metrics=entries)
-        self._client.finalize_logged_model(model.model_id, LoggedModelStatus.READY)
+            model = self._client.create_logged_model(
+                self._experiment,
+                name=f"{self.config.name}-step-{step}",
+                source_run_id=self.run_id,
+                tags={"checkpoint": str(path), "step": str(step)},
+                model_type="checkpoint",
+            )
+            now = int(time.time() * 1000)
+            entries = [Metric(k, float(v), now, step, model_id=model.model_id) for k, v in values.items()]
+            if entries:
+                self._client.log_batch(self.run_id, metrics=entries)
+            self._client.finalize_logged_model(model.model_id, LoggedModelStatus.READY)
+            self._client.set_tag(self.run_id, "checkpoint", str(path))
 
     def close(self, status: str) -> None:
         """Waits for what is still being written and ends the run: FINISHED, FAILED or KILLED (to be continued)."""
         if self._client is None:
             return
-        import mlflow
+        with self._recording("the end of the run"):
+            import mlflow
 
-        mlflow.flush_async_logging()
-        self._client.set_terminated(self.run_id, status=status)
+            mlflow.flush_async_logging()
+            self._client.set_terminated(self.run_id, status=status)
+
+    @contextmanager
+    def _recording(self, what: str) -> Iterator[None]:
+        """A store that fails in mid-run costs a warning, never the training."""
+        from mlflow.exceptions import MlflowException
+
+        try:
+            yield
+        except (MlflowException, OSError) as error:
+            reason = str(error).splitlines()[0]
+            print(f"warning: MLflow did not record {what}: {reason}", file=sys.stderr, flush=True)
 
 
 def environment() -> dict[str, Any]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,7 +86,7 @@ class Trainer:
             lambda parameters: build_optimizer(config.train, parameters),
             4 * config.data.places_per_batch // world_size(),
         )
-        self.engine.load(optimizer)
+        self.engine.load(optimizer, self.state.scaler)
         self.loss = MultiSimilarityLoss(
             alpha=config.loss.alpha, beta=config.loss.beta, base=config.loss.base, margin=config.loss.margin
         )
@@ -99,7 +100,7 @@ class Trainer:
             Diverged: the loss is not finite; the last good checkpoint stays.
             DataError: a shard or a validation image cannot be read.
         """
-        if self.state.finished and self.state.step >= self.total_steps:
+        if self._ended():
             return Outcome(self.run, self.state, "already finished")
         self._open()
         status = "FAILED"
@@ -107,12 +108,10 @@ class Trainer:
             with stop_signals() as self.stops:
                 if self.state.step == 0 and self.validation is not None and self.config.train.validate_first:
                     self._validate()
-                while not (reason := self._ended()):
+                while not self._ended():
                     self._epoch()
-            self.state.finished = reason
-            self._save()
             status = "FINISHED"
-            return Outcome(self.run, self.state, reason)
+            return Outcome(self.run, self.state, self._ended())
         except (Preempted, KeyboardInterrupt):
             status = "KILLED"
             raise
@@ -139,6 +138,7 @@ class Trainer:
         if state.cursor >= self.steps_per_epoch:
             state.epoch, state.cursor = state.epoch + 1, 0
         if self.validation is not None:
+            self._save()  # validation can take minutes: a kill in it must not cost the epoch
             self._validate()
         self._save()
 
@@ -199,6 +199,7 @@ class Trainer:
     def _save(self) -> None:
         """One checkpoint (collective): whole tensors are gathered on rank 0, which writes."""
         self.state.world_size = world_size()
+        self.state.scaler = self.engine.scaler()
         tensors, optimizer = self.engine.state()
         problem: UserError | None = None
         if self.main:
@@ -238,6 +239,8 @@ class Trainer:
         path = checkpoint.find(self.run, self.config.train.resume)
         if path is None:
             return RunState(index=self.index.digest), {}
+        if rank() == 0:
+            print(f"continuing from {path}", file=sys.stderr, flush=True)
         state, config, optimizer = checkpoint.read(path)
         checkpoint.check_same(config, self.config, state, self.index.digest)
         load_trainable(model, path)
@@ -252,6 +255,7 @@ class Trainer:
         problem = None
         if self.main:
             self.run.mkdir(parents=True, exist_ok=True)
+            self._forget_samples()
             (self.run / "config.json").write_text(json.dumps(to_dict(config), indent=1) + "\n")
             # a run killed before its first checkpoint left its id here
             known = self.state.run_id or (note.read_text().strip() if note.exists() else "")
@@ -263,7 +267,6 @@ class Trainer:
                 problem = error
         else:
             self.tracker = Tracker(config, enabled=False)
-            self._forget_samples()
         problem = broadcast_object(problem)
         if problem is not None:
             raise problem
