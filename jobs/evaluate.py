@@ -96,7 +96,8 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     if job.figures:
         pictures = report.draw(results, sets, output / "figures")
         facts = {key: str(value) for key, value in about.items()}
-        report.write_report(results, pictures, output / "report.html", f"Evaluation of {file.parent.name}", facts)
+        title = f"Evaluation of {(runs[0] if runs else file).name}"
+        report.write_report(results, pictures, output / "report.html", title, facts)
     print(f"\nwritten to {output}/" + (": open report.html in a browser" if job.figures else ""))
 
 

@@ -98,7 +98,7 @@ def write_report(
     parts = [
         f"<h1>{html.escape(title)}</h1><p class=about>{facts}</p><nav>{links}</nav>",
         f"<h2>Recall and its protocol</h2><div class=card>{_table(results)}<ul>",
-        *(f"<li>{html.escape(note)}</li>" for note in notes(results)),
+        *(f"<li>{html.escape(note.replace('* best', 'green: best'))}</li>" for note in notes(results)),
         "</ul></div>",
     ]
     for name in names:
