@@ -57,7 +57,8 @@ def start(timeout: float) -> Any:
         raise UsageError(
             f"{launched} processes were launched but this one is in a group of {accelerator.num_processes}; {ADVICE}"
         )
-    if not cuda:
+    if not cuda and (launched > 1 or "OMP_NUM_THREADS" not in os.environ):
+        # (launchers set that variable to 1 whatever the machine has)
         local = int(os.environ.get("LOCAL_WORLD_SIZE", launched))
         torch.set_num_threads(max(1, (os.cpu_count() or 1) // max(1, local)))
     return accelerator

@@ -8,18 +8,15 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 import yaml
+from job_process import JobProcess
 from safetensors.torch import load_file
 from tiny import prepare, run_settings
-
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
-ENVIRONMENT.pop("MLFLOW_TRACKING_URI", None)
 
 
 @pytest.fixture(scope="module")
@@ -41,20 +38,29 @@ def config(root: Path, name: str, **changes: Any) -> Path:
     return path
 
 
-def command(path: Path, *overrides: str, processes: int = 1) -> list[str]:
-    job = ["-m", "jobs.train", "--config", str(path), *overrides]
-    if processes == 1:
-        return [sys.executable, *job]
+def start(path: Path, *overrides: str) -> JobProcess:
+    return JobProcess("jobs.train", ["--config", str(path), *overrides], path.with_suffix(".log"))
+
+
+def train(path: Path, *overrides: str, code: int = 0) -> str:
+    """One process; its output."""
+    job = start(path, *overrides)
+    assert job.wait() == code, job.text()[-3000:]
+    return job.text()
+
+
+def launch(path: Path, *overrides: str, processes: int = 1) -> None:
+    """Fresh interpreters, by the real launcher."""
     launcher = [sys.executable, "-m", "accelerate.commands.accelerate_cli", "launch"]
-    return [*launcher, "--config_file", "jobs/accelerate/cpu.yaml", "--num_processes", str(processes), *job]
-
-
-def train(path: Path, *overrides: str, processes: int = 1, code: int = 0) -> str:
+    if processes == 1:
+        launcher = [sys.executable]
+    else:
+        launcher += ["--config_file", "jobs/accelerate/cpu.yaml", "--num_processes", str(processes)]
     done = subprocess.run(
-        command(path, *overrides, processes=processes), env=ENVIRONMENT, capture_output=True, text=True, timeout=240
-    )
-    assert done.returncode == code, done.stdout[-1500:] + done.stderr[-3000:]
-    return done.stdout + done.stderr
+        [*launcher, "-m", "jobs.train", "--config", str(path), *overrides],
+        env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, timeout=240,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-3000:]
 
 
 def weights(root: Path, name: str, which: str = "last") -> dict[str, torch.Tensor]:
@@ -82,19 +88,14 @@ def whole(root: Path) -> str:
     return "whole"
 
 
-def kill_at(path: Path, step: int, log: Path, processes: int = 1) -> None:
-    """Starts a run and kills all its processes with SIGKILL once the sample log shows the step."""
-    process = subprocess.Popen(
-        command(path, processes=processes), env=ENVIRONMENT, start_new_session=True,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    deadline = time.monotonic() + 120
-    while not (log.exists() and f'"step": {step},' in log.read_text()):
-        assert process.poll() is None, "the run ended before it was killed"
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+def kill_at(root: Path, path: Path, step: int, number: int = signal.SIGKILL) -> JobProcess:
+    """Starts a run and signals it once its sample log shows the step."""
+    log = root / "outputs" / path.stem / "samples.rank0.jsonl"
+    job = start(path)
+    job.kill_when(lambda: log.exists() and f'"step": {step},' in log.read_text(), number)
+    code = job.wait()
+    assert code == (-number if number == signal.SIGKILL else 75), job.text()[-3000:]
+    return job
 
 
 @pytest.mark.parametrize("step", [1, 5])
@@ -102,7 +103,7 @@ def test_killed_and_resumed_gives_the_same_bits(root: Path, whole: str, step: in
     """Before the first checkpoint, and between two."""
     name = f"killed{step}"
     path = config(root, name)
-    kill_at(path, step, root / "outputs" / name / "samples.rank0.jsonl")
+    kill_at(root, path, step)
     train(path)
     assert same_bits(weights(root, name), weights(root, whole))
     assert samples(root, name) == samples(root, whole)
@@ -117,8 +118,8 @@ def test_elastic_two_processes_after_one(root: Path, whole: str) -> None:
                   "heads": 2, "feedforward": 16}})  # fmt: skip
     reference = config(root, "elastic-reference", model=yaml.safe_load(path.read_text())["model"])
     train(reference)
-    kill_at(path, 5, root / "outputs/elastic/samples.rank0.jsonl")
-    train(path, processes=2)
+    kill_at(root, path, 5)
+    launch(path, processes=2)
     assert samples(root, "elastic") == samples(root, "elastic-reference") == samples(root, whole)
     one, two = weights(root, "elastic-reference"), weights(root, "elastic")
     # float32 and Adam, which divides rounding by its own size: near, and far from the distance that training moved
@@ -138,26 +139,17 @@ def test_each_epoch_shows_each_place_at_most_once(root: Path, whole: str) -> Non
 def test_a_signal_saves_and_leaves_with_75(root: Path, whole: str, number: signal.Signals) -> None:
     name = f"stopped-{number.name}"
     path = config(root, name, train__save_every=1000)
-    process = subprocess.Popen(
-        command(path), env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    log = root / "outputs" / name / "samples.rank0.jsonl"
-    while not (log.exists() and '"step": 2,' in log.read_text()):
-        assert process.poll() is None
-        time.sleep(0.002)
-    seen = len(log.read_text().splitlines())
-    process.send_signal(number)
-    out, _ = process.communicate(timeout=60)
-    assert process.returncode == 75, out
+    kill_at(root, path, 2, number)
+    seen = max(samples(root, name))
     saved = json.loads((root / "outputs" / name / "checkpoints/last/state.json").read_text())["state"]["step"]
-    assert seen <= saved <= seen + 2, "saved within one step of the signal"
+    assert 2 <= saved == seen <= 4, "saved within a step of the signal"
     assert json.loads((root / "outputs" / name / "status.json").read_text())["exit_code"] == 75
     train(path)
     assert same_bits(weights(root, name), weights(root, whole))
 
 
 def test_workers_do_not_change_a_bit(root: Path, whole: str) -> None:
-    train(config(root, "workers", data__workers=2))
+    launch(config(root, "workers", data__workers=2))
     assert same_bits(weights(root, "workers"), weights(root, whole))
 
 
@@ -228,7 +220,7 @@ def test_recorded_in_mlflow_and_continued_there(root: Path) -> None:
     from mlflow import MlflowClient
 
     path = config(root, "recorded", tracking={"enabled": True}, train__epochs=1)
-    kill_at(path, 5, root / "outputs/recorded/samples.rank0.jsonl")
+    kill_at(root, path, 5)
     train(path)
     client = MlflowClient(tracking_uri=f"sqlite:///{root / 'outputs/mlflow.db'}")
     experiment = client.get_experiment_by_name("place-recognition")
