@@ -223,8 +223,8 @@ class TrainConfig:
     patience: int = 3
     """Stop after this many epochs without a better validation R@5 (paper: 3); 0 never stops early."""
     encode_chunk: int | None = None
-    """Images encoded at a time on a rank, recomputed in backward; none: all at once. Needs adapter.norm other than
-    batch, since BatchNorm would see chunks."""
+    """Images encoded at a time on a rank, recomputed in backward; none: all at once. Always exact. Memory then does not
+    grow with the batch for adapter.norm group or none; with batch it grows slower, as BatchNorm needs all images."""
     compile: bool = False
     """torch.compile the backbone."""
     engine: Literal["auto", "ddp", "fsdp2"] = "auto"

@@ -24,8 +24,8 @@ class GlobalBatchNorm2d(nn.BatchNorm2d):
     of 2C numbers backward. At W = 1, and in eval mode, it is torch's own kernel.
 
     Under `torch.utils.checkpoint` the second forward, inside backward, recomputes the same output but leaves the
-    running buffers alone: they move once a step. Chunks are another matter: each would be normalised by itself, so
-    `PlaceModel.encode` refuses them.
+    running buffers alone: they move once a step. Chunks of the batch would each be normalised by themselves, so
+    `PlaceModel.encode` takes its chunks through the blocks in step (pipeline.model.lockstep).
     """
 
     def forward(self, input: Tensor) -> Tensor:

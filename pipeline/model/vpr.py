@@ -10,12 +10,12 @@ from __future__ import annotations
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from pipeline.config import ModelConfig
 from pipeline.model.backbone import Backbone
 from pipeline.model.batch_norm import GlobalBatchNorm2d
 from pipeline.model.cross_image import CrossImageEncoder
+from pipeline.model.lockstep import in_step, recomputed
 from pipeline.model.pooling import Pooling, at_least_float32
 from shards.errors import UsageError
 
@@ -44,11 +44,13 @@ class PlaceModel(nn.Module):
 
         Args:
             images: float, ImageNet-normalised, S = `image_size`.
-            chunk: images encoded at a time; under gradient each chunk keeps its input alone and is recomputed in
-                backward, so peak memory depends on the chunk and not on b. The result is the same.
+            chunk: images encoded at a time and recomputed in backward; the result is the same, to rounding. Each chunk
+                keeps its input alone, so peak memory depends on the chunk and not on b. With BatchNorm in training
+                the chunks go in step, block by block (pipeline.model.lockstep), so that it still sees the global
+                batch: then memory grows with b, though much less than without chunks.
 
         Raises:
-            UsageError: images of another size; chunks where training BatchNorm would see them one by one.
+            UsageError: images of another size; a chunk below 1.
         """
         if images.ndim != 4 or images.shape[-2:] != (self.image_size, self.image_size):
             raise UsageError(
@@ -59,14 +61,10 @@ class PlaceModel(nn.Module):
         if chunk < 1:
             raise UsageError(f"train.encode_chunk {chunk} must be at least 1")
         if self.training and any(isinstance(m, GlobalBatchNorm2d) for m in self.modules()):
-            raise UsageError(
-                f"train.encode_chunk {chunk} does not go with adapter.norm batch: BatchNorm would normalise each chunk "
-                "by itself instead of the global batch; choose adapter.norm group or none, or leave encode_chunk out"
-            )
-        parts = images.split(chunk)
-        if torch.is_grad_enabled():
-            return torch.cat([checkpoint(self._regions, part, use_reentrant=False) for part in parts])
-        return torch.cat([self._regions(part) for part in parts])
+            with in_step(self.backbone, chunk):
+                tokens = self.backbone(images)
+            return torch.cat([recomputed(self.pooling, part) for part in tokens.split(chunk)])
+        return torch.cat([recomputed(self._regions, part) for part in images.split(chunk)])
 
     def _regions(self, images: Tensor) -> Tensor:
         regions: Tensor = self.pooling(self.backbone(images))

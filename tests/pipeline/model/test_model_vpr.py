@@ -72,7 +72,7 @@ def test_released_sizes_have_the_released_parameter_counts() -> None:
         assert parameter_counts(model)["backbone"] == count
 
 
-@pytest.mark.parametrize("norm", ["group", "none"])
+@pytest.mark.parametrize("norm", ["batch", "group", "none"])
 def test_chunks_change_nothing_but_memory(norm: str, small: ModelConfig, small_images: Tensor) -> None:
     adapter = dataclasses.replace(small.adapter, norm=norm)  # type: ignore[arg-type]
     cross_image = dataclasses.replace(small.cross_image, dropout=0.0)
@@ -91,13 +91,26 @@ def test_chunks_change_nothing_but_memory(norm: str, small: ModelConfig, small_i
             assert torch.allclose(chunked[name], whole, rtol=1e-10, atol=1e-13), name
 
 
-def test_chunks_are_refused_where_batch_norm_would_see_them(small: ModelConfig, small_images: Tensor) -> None:
-    model = build_model(small, SIZE)
-    with pytest.raises(UsageError, match=r"adapter\.norm batch.*adapter\.norm group"):
-        model(small_images, chunk=2)
-    model.eval()  # stored statistics: chunks are exact
+def test_chunks_leave_the_running_statistics_as_they_would_be(small: ModelConfig, small_images: Tensor) -> None:
+    """BatchNorm sees all images at once, and once: neither chunk by chunk nor again when backward recomputes."""
+    buffers = []
+    for chunk in (None, 3):
+        torch.manual_seed(0)
+        model = build_model(small, SIZE).double()
+        model(small_images.double(), chunk=chunk).sum().backward()
+        buffers.append(dict(model.named_buffers()))
+        assert "forward" not in model.backbone.blocks[0].__dict__  # nothing left hanging on the blocks
+    assert any(name.endswith("running_mean") for name in buffers[0])
+    for name, whole in buffers[0].items():
+        torch.testing.assert_close(buffers[1][name], whole, rtol=1e-12, atol=1e-14)
+
+
+def test_chunks_are_whole_and_exact_in_evaluation(small: ModelConfig, small_images: Tensor) -> None:
+    model = build_model(small, SIZE).eval()
     with torch.no_grad():
         assert torch.allclose(model(small_images, chunk=3), model(small_images), atol=1e-6)
+    with pytest.raises(UsageError, match="encode_chunk 0"):
+        model(small_images, chunk=0)
 
 
 def test_a_descriptor_depends_on_its_group_and_regions_do_not(small: ModelConfig, small_images: Tensor) -> None:

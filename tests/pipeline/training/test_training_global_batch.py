@@ -119,12 +119,14 @@ def test_gradients_tensor_by_tensor() -> None:
         assert difference < 1e-9, (name, float(difference))
 
 
+@pytest.mark.parametrize("variant", ["published", "adapters_only", "group_norm"])
 @pytest.mark.parametrize("world", [1, 2])
-def test_chunks_give_the_same_gradients(world: int) -> None:
-    config = VARIANTS["group_norm"]
+def test_chunks_give_the_same_gradients(world: int, variant: str) -> None:
+    """Also with BatchNorm, whose statistics and buffers stay those of the global batch."""
+    config = VARIANTS[variant]
     whole = steps(config)
     found = steps(config, 5) if world == 1 else run_ranks(steps, world, config, 5)[1]
-    for what in ("gradients", "weights"):
+    for what in ("gradients", "weights", "buffers"):
         assert worst(whole[what], found[what]) < 1e-9
     assert found["losses"] == pytest.approx(whole["losses"], rel=1e-9)
 
