@@ -13,6 +13,11 @@ import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from pipeline.model_config import AdapterConfig as AdapterConfig
+from pipeline.model_config import BackboneConfig as BackboneConfig
+from pipeline.model_config import CrossImageConfig as CrossImageConfig
+from pipeline.model_config import ModelConfig as ModelConfig
+from pipeline.model_config import PoolingConfig as PoolingConfig
 from shards.errors import UsageError
 
 
@@ -44,95 +49,6 @@ class DataConfig:
     """Local folder for shards fetched from a URL."""
     cache_gb: float = 50.0
     """Bound of that cache in GB (10^9 bytes)."""
-
-
-@dataclass(frozen=True)
-class BackboneConfig:
-    """The image encoder. `name` fills the sizes; `custom` takes them from the fields below."""
-
-    name: Literal["dinov2_vits14", "dinov2_vitb14", "dinov2_vitl14", "dinov2_vitg14", "custom"] = "dinov2_vitb14"
-    """DINOv2 variant (paper: ViT-B/14 without registers), or custom."""
-    weights: str | None = None
-    """A released DINOv2 .pth, a safetensors file, a transformers folder or hub name; none: random weights."""
-    dim: int = 768
-    """custom: channels D of a token."""
-    depth: int = 12
-    """custom: transformer blocks."""
-    heads: int = 12
-    """custom: attention heads of a block."""
-    patch: int = 14
-    """custom: patch side in pixels."""
-    mlp_ratio: int = 4
-    """custom: hidden width of the MLP over dim."""
-    layerscale: float = 1.0
-    """custom: initial LayerScale; 1.0 suits training from scratch, 1e-5 is DINOv2's own start."""
-    pretrain_grid: int = 37
-    """custom: side of the stored position embedding's grid; it is resized once to the input's grid (DINOv2: 37)."""
-    attention: Literal["sdpa", "eager", "flash_attention_2", "flex_attention"] = "sdpa"
-    """Attention implementation of transformers."""
-
-
-@dataclass(frozen=True)
-class AdapterConfig:
-    """The adapter beside the MLP of every block (paper, section 3.3)."""
-
-    kind: Literal["mulconv", "vanilla", "conv", "conv1x1", "conv3x3", "conv5x5", "none"] = "mulconv"
-    """mulconv (paper); vanilla bottleneck; conv: 3x3 without skip (Convpass-like); single kernels with skip; none."""
-    ratio: float = 0.5
-    """Bottleneck width over dim (paper: 0.5, so 384)."""
-    reduced: int = 24
-    """Channels after the 1x1 reduction of the 3x3 and 5x5 paths (paper: 24)."""
-    scale: float = 0.2
-    """The factor s of Eq. 4 (paper: 0.2)."""
-    norm: Literal["batch", "group", "none"] = "batch"
-    """Normalisation in the convolution paths: global BatchNorm (published), GroupNorm (per image), or none."""
-    init: Literal["kaiming", "published"] = "kaiming"
-    """Convolution initialisation: Kaiming (ours), or the published constant 1e-5, which keeps reductions one channel
-    wide for ever."""
-
-
-@dataclass(frozen=True)
-class PoolingConfig:
-    """Patch tokens to regional features (paper, section 3.2)."""
-
-    kind: Literal["spm", "spmg", "gem", "cls"] = "spm"
-    """spm: pyramid, class token as its first level (paper); spmg: GeM on all levels; gem: one GeM; cls: class token."""
-    levels: tuple[int, ...] = (1, 2, 3)
-    """Pyramid levels n, each of n x n cells (paper: 1, 2, 3, so 14 regions)."""
-    p: float = 3.0
-    """Initial exponent of GeM, learnable and shared (published: 3)."""
-
-
-@dataclass(frozen=True)
-class CrossImageConfig:
-    """The cross-image encoder: attention over the images of the batch, region by region (paper, Eq. 3)."""
-
-    layers: int = 2
-    """Transformer encoder layers; 0 leaves the encoder out (paper: 2)."""
-    heads: int = 16
-    """Attention heads (published: 16)."""
-    feedforward: int = 2048
-    """Width of the feed-forward part (published: 2048)."""
-    dropout: float = 0.1
-    """Dropout in attention, feed-forward and residuals (published: 0.1)."""
-
-
-@dataclass(frozen=True)
-class ModelConfig:
-    """The assembled model."""
-
-    backbone: BackboneConfig = field(default_factory=BackboneConfig)
-    """The image encoder."""
-    adapter: AdapterConfig = field(default_factory=AdapterConfig)
-    """The adapters in its blocks."""
-    pooling: PoolingConfig = field(default_factory=PoolingConfig)
-    """Regional features."""
-    cross_image: CrossImageConfig = field(default_factory=CrossImageConfig)
-    """The cross-image encoder."""
-    train: Literal["adapters", "full", "frozen", "last"] = "adapters"
-    """What of the backbone is trained: its adapters (paper), all of it, nothing, or the last blocks."""
-    last_blocks: int = 4
-    """train=last: how many blocks at the end are trained."""
 
 
 @dataclass(frozen=True)

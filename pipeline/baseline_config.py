@@ -1,0 +1,90 @@
+"""Settings of the baselines' parts: residual networks and aggregators; `pipeline.config` holds them in its own.
+
+Invariant: defaults are the sizes published with each method, so that a name alone gives the published shape. No torch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class ResNetConfig:
+    """A residual network of bottlenecks, as far as it is used."""
+
+    cut: Literal["layer2", "layer3", "layer4"] = "layer4"
+    """Last stage used: layer3 has stride 16 and 1024 channels, layer4 stride 32 and 2048."""
+    layout: Literal["torchvision", "keras"] = "torchvision"
+    """Whose weights: keras puts a down-sampling bottleneck's stride in its first convolution, has BatchNorm eps
+    1.001e-5 and takes BGR 0..255 minus means (converted inside: the model's input stays the same)."""
+    stages: tuple[int, ...] = (3, 4, 6, 3)
+    """resnet_custom: bottlenecks of the four stages."""
+    width: int = 64
+    """resnet_custom: channels after the first convolution; a stage's output is 4, 8, 16, 32 times as wide."""
+
+
+@dataclass(frozen=True)
+class NetVLADConfig:
+    """Residuals to soft-assigned cluster centres (Arandjelovic et al., CVPR 2016)."""
+
+    clusters: int = 64
+    """Clusters K; the descriptor has K x D numbers (published: 64)."""
+    samples: int = 50_000
+    """Patch features that k-means starts the centres from, before the first step (published: 50,000)."""
+    per_image: int = 100
+    """Of them at most this many an image (published: 100)."""
+
+
+@dataclass(frozen=True)
+class CosPlaceConfig:
+    """GeM and a linear layer (Berton et al., CVPR 2022)."""
+
+    dim: int = 512
+    """Output dimensions (published: 32 to 2048, 512 most used)."""
+
+
+@dataclass(frozen=True)
+class MixVPRConfig:
+    """Feature mixing over positions (Ali-bey et al., WACV 2023)."""
+
+    channels: int = 1024
+    """Channels after the projection (published: 1024)."""
+    rows: int = 4
+    """Rows after the projection; the descriptor has channels x rows numbers (published: 4, so 4096)."""
+    depth: int = 4
+    """Mixer layers (published: 4)."""
+    mlp_ratio: float = 1.0
+    """Hidden width of a mixer over the number of positions (published: 1)."""
+
+
+@dataclass(frozen=True)
+class SALADConfig:
+    """Optimal transport to clusters with a dustbin (Izquierdo and Civera, CVPR 2024)."""
+
+    clusters: int = 64
+    """Clusters; fewer than patches (published: 64)."""
+    channels: int = 128
+    """Channels of a cluster (published: 128)."""
+    token: int = 256
+    """Channels of the projected class token (published: 256, so 64 x 128 + 256 = 8448)."""
+    hidden: int = 512
+    """Width of the three two-layer projections (published: 512)."""
+    iterations: int = 3
+    """Sinkhorn iterations (published: 3)."""
+    dropout: float = 0.3
+    """Dropout in the projections of patches (published: 0.3)."""
+
+
+@dataclass(frozen=True)
+class BoQConfig:
+    """Learnable queries that attend to the patches, layer by layer (Ali-bey et al., CVPR 2024)."""
+
+    channels: int = 384
+    """Channels after the 3x3 projection, a multiple of 64 (published: 384 on DINOv2, 512 on ResNet-50)."""
+    queries: int = 64
+    """Queries of a layer (published: 64)."""
+    layers: int = 2
+    """Layers (published: 2)."""
+    rows: int = 32
+    """Rows after the last projection; the descriptor has channels x rows numbers (published: 32, so 12288)."""
