@@ -10,9 +10,11 @@ Exit codes: 0 done, 2 usage or configuration, 3 data, 4 diverged, 75 preempted a
 from __future__ import annotations
 
 import difflib
+import json
 import os
 import re
 import sys
+import typing
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, TypeVar
 
@@ -27,7 +29,8 @@ def parse(kind: type[Config], description: str, argv: Sequence[str] | None = Non
     Args:
         kind: the dataclass; nested dataclasses become dotted options.
         description: first lines of `--help`.
-        argv: arguments, `sys.argv[1:]` by default. Dashes in option names are underscores; a bool field is a switch.
+        argv: arguments, `sys.argv[1:]` by default. Dashes in option names are underscores; a bool field is a
+            switch; a tuple may be given as `a,b`.
         config_file: whether `--config FILE` (YAML) is accepted; later options override it.
 
     Raises:
@@ -74,23 +77,24 @@ def _program() -> str:
 
 
 def _normalise(argv: Sequence[str], parser: Any) -> list[str]:
-    """`--max-bad` for `--max_bad`, and a switch without a value, `--dry-run`, for `--dry_run true`."""
-    switches = {
-        option
-        for action in parser._actions
-        for option in action.option_strings
-        if getattr(action, "_typehint", None) is bool
-    }
+    """`--max-bad` for `--max_bad`; a switch without a value, `--dry-run`; `--sets a,b` for `--sets '["a", "b"]'`."""
+    hints = {option: getattr(a, "_typehint", None) for a in parser._actions for option in a.option_strings}
     words: list[str] = []
-    for i, word in enumerate(argv):
+    for word in argv:
         if word.startswith("--"):
+            if words and hints.get(words[-1]) is bool:
+                words.append("true")
             name, equals, value = word.partition("=")
             name = "--" + name[2:].replace("-", "_")
-            words.append(name + equals + value)
-            if name in switches and not equals and (i + 1 == len(argv) or argv[i + 1].startswith("-")):
-                words.append("true")
+            words += [name, value] if equals else [name]
         else:
             words.append(word)
+        if len(words) > 1 and typing.get_origin(hints.get(words[-2])) is tuple and not words[-1].startswith("["):
+            kinds = typing.get_args(hints[words[-2]])
+            items = [i for i in words[-1].split(",") if i]
+            words[-1] = "[" + ", ".join(items if int in kinds else map(json.dumps, items)) + "]"
+    if words and hints.get(words[-1]) is bool:
+        words.append("true")
     return words
 
 
@@ -100,9 +104,10 @@ def _readable(message: str, known: list[str]) -> str:
     unknown = re.search(r"(?:unrecognized arguments: --|[Kk]ey '|option ')([\w.-]+)", line)
     if unknown:
         word = unknown.group(1)
-        near = difflib.get_close_matches(word, known, n=1, cutoff=0.5) or difflib.get_close_matches(
-            word.split(".")[-1], [k.split(".")[-1] for k in known], n=1, cutoff=0.5
-        )
+        last = word.rsplit(".", 1)[-1]
+        near = [name for name in known if name.rsplit(".", 1)[-1] == last]  # right name, wrong or no section
+        near = near or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+        near = near or [n for n in known if difflib.get_close_matches(last, [n.rsplit(".", 1)[-1]], cutoff=0.7)]
         if near and near[0] != word:
             line += f" (did you mean '{near[0]}'?)"
     return line

@@ -27,6 +27,8 @@ class EvaluateJob(EvaluationConfig):
     """A run folder (its best checkpoint), a checkpoint folder, a .safetensors file, or a released CricaVPR .pth."""
     output: str | None = None
     """Folder of all results; none: `<run>/evaluation`."""
+    track: bool = True
+    """Record the recalls in the checkpoint's MLflow run, where it has one."""
     figures: bool = True
     """Draw figures and the HTML report."""
     timeout: float = 1800.0
@@ -35,7 +37,7 @@ class EvaluateJob(EvaluationConfig):
 
 def main() -> None:
     """Parses, evaluates, reports."""
-    job = parse(EvaluateJob, __doc__ or "", listed(sys.argv[1:]))
+    job = parse(EvaluateJob, __doc__ or "")
     if not job.checkpoint:
         raise UsageError("--checkpoint is missing: a run folder such as outputs/cricavpr, or a model file")
     config = EvaluationConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(EvaluationConfig)})
@@ -59,7 +61,7 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     from pipeline.evaluation.datasets import available, load_set
     from pipeline.evaluation.evaluate import evaluate, fit_projections, model_fingerprint
     from pipeline.evaluation.predictions import save_predictions
-    from pipeline.model.weights import checkpoint_file, load_model, load_published
+    from pipeline.model.weights import checkpoint_file, load_model, load_published, read_metadata
 
     device, first = accelerator.device, accelerator.is_main_process  # type: ignore[attr-defined]
     file = checkpoint_file(job.checkpoint)
@@ -68,7 +70,7 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     for name in names:
         try:
             sets.append(load_set(name, config))
-        except DataError as error:
+        except (DataError, UsageError) as error:
             left_out.append(f"{name}: {error}")
     if not sets:
         raise DataError("; ".join(left_out) or f"no evaluation set under {config.root}/: give --sets or --root")
@@ -98,16 +100,12 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
         facts = {key: str(value) for key, value in about.items()}
         title = f"Evaluation of {(runs[0] if runs else file).name}"
         report.write_report(results, pictures, output / "report.html", title, facts)
+    if job.track and runs:
+        from pipeline.training.tracking import record_evaluation
+
+        values = {name: value for entry in tables.as_dicts(results) for name, value in entry["metrics"].items()}
+        record_evaluation(runs[0], read_metadata(file)["extra"], values, output)
     print(f"\nwritten to {output}/" + (": open report.html in a browser" if job.figures else ""))
-
-
-def listed(argv: list[str]) -> list[str]:
-    """`--sets a,b` as well as `--sets '[a, b]'`."""
-    words = list(argv)
-    for i, word in enumerate(words[1:], 1):
-        if words[i - 1] in ("--sets", "--groups", "--recalls") and not word.startswith("["):
-            words[i] = "[" + ", ".join(f'"{w}"' if words[i - 1] != "--recalls" else w for w in word.split(",")) + "]"
-    return words
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ computed; a store that cannot be reached is an error at the start, not a surpris
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import sys
@@ -91,7 +92,8 @@ class Tracker:
         )
         self.run_id = run.info.run_id
         values = [Param(key, str(value)) for key, value in flatten(self.config).items()]
-        self._client.log_batch(self.run_id, params=values)
+        for first in range(0, len(values), 100):  # MLflow takes at most 100 a call
+            self._client.log_batch(self.run_id, params=values[first : first + 100])
         self._client.log_dict(self.run_id, to_dict(self.config), "config.yaml")
         self._client.log_dict(self.run_id, environment(), "environment.yaml")
 
@@ -157,6 +159,36 @@ class Tracker:
         except (MlflowException, OSError) as error:
             reason = str(error).splitlines()[0]
             print(f"warning: MLflow did not record {what}: {reason}", file=sys.stderr, flush=True)
+
+
+def record_evaluation(run: Path, written: dict[str, Any], values: dict[str, float], folder: Path) -> bool:
+    """Records an evaluation in the MLflow run that trained the checkpoint; False where that run was not recorded.
+
+    Args:
+        run: the run's folder (its config says which store).
+        written: what the checkpoint says of itself ("mlflow_run_id", "step").
+        values: recalls by metric name, without the kind: recorded as `evaluation/<name>`.
+        folder: results.json, report.html and figures, stored as artifacts.
+    """
+    config = run / "config.json"
+    if not written.get("mlflow_run_id") or not config.exists():
+        return False
+    told = json.loads(config.read_text())
+    uri = store_uri(told["tracking"]["uri"], str(run.parent))
+    client = open_client(uri)
+    from mlflow.entities import Metric
+    from mlflow.exceptions import MlflowException
+
+    now = int(time.time() * 1000)
+    entries = [Metric(f"evaluation/{k}", float(v), now, int(written["step"])) for k, v in values.items()]
+    try:
+        client.log_batch(written["mlflow_run_id"], metrics=entries)
+        for name in ("results.json", "results.md", "report.html"):
+            if (folder / name).exists():
+                client.log_artifact(written["mlflow_run_id"], str(folder / name), "evaluation")
+    except MlflowException as error:
+        raise UsageError(f"MLflow at {uri} did not take the evaluation: {str(error).splitlines()[0]}") from error
+    return True
 
 
 def environment() -> dict[str, Any]:

@@ -14,7 +14,6 @@ import pytest
 import torch
 from PIL import Image
 
-from jobs.evaluate import listed
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, PoolingConfig
 from pipeline.model.vpr import build_model
 from pipeline.model.weights import save_model
@@ -94,8 +93,3 @@ def test_what_is_missing_is_said_in_one_line(run_folder: Path) -> None:
     assert "Traceback" not in nothing.stderr
     unnamed = start(run_folder)
     assert unnamed.returncode == 2 and "--checkpoint is missing" in unnamed.stderr
-
-
-def test_lists_may_be_written_plainly() -> None:
-    assert listed(["--sets", "a,b:c->d", "--recalls", "1,5"]) == ["--sets", '["a", "b:c->d"]', "--recalls", "[1, 5]"]
-    assert listed(["--sets", "[a]", "--pca", "512"]) == ["--sets", "[a]", "--pca", "512"]
