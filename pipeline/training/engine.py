@@ -7,7 +7,6 @@ checkpoint does not know which engine or how many ranks wrote it.
 
 from __future__ import annotations
 
-import copy
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -71,7 +70,7 @@ class Engine:
     def gradients(self, loss: Tensor) -> dict[str, Tensor]:
         """The averaged gradients of `loss` as whole tensors (collective), cleared afterwards; for tests and tables."""
         self.accelerator.backward(loss)
-        found = {n: _whole(p.grad).detach().cpu().clone() for n, p in self.names().items() if p.grad is not None}
+        found = {n: whole(p.grad).detach().cpu().clone() for n, p in self.names().items() if p.grad is not None}
         self.optimizer.zero_grad(set_to_none=True)
         return found
 
@@ -100,15 +99,15 @@ class Engine:
         (The weights are loaded into the model before it is wrapped.)
         """
         if scaler and getattr(self.accelerator, "scaler", None) is not None:
-            whole = ("growth_interval", "_growth_tracker")
-            self.accelerator.scaler.load_state_dict({k: int(v) if k in whole else v for k, v in scaler.items()})
+            integers = ("growth_interval", "_growth_tracker")
+            self.accelerator.scaler.load_state_dict({k: int(v) if k in integers else v for k, v in scaler.items()})
         inner = getattr(self.optimizer, "optimizer", self.optimizer)
         parameters = self.names()
         for key, value in optimizer.items():
             name, state = key.rsplit("/", 1)
             parameter = parameters[name]
             # the step counter stays on the CPU, where torch's own optimisers keep it
-            inner.state[parameter][state] = value.clone() if value.ndim == 0 else _like(value, parameter)
+            inner.state[parameter][state] = value.clone() if value.ndim == 0 else placed_like(value, parameter)
 
     @contextmanager
     def plain(self) -> Iterator[PlaceModel]:
@@ -125,63 +124,19 @@ class Engine:
         keep = rank() == 0
         found: dict[str, Tensor] = {}
         for name, tensor in tensors:
-            whole = _whole(tensor)  # collective: every rank takes part, rank 0 keeps
+            full = whole(tensor)  # collective: every rank takes part, rank 0 keeps
             if keep:
-                found[name] = whole.detach().cpu().clone()
+                found[name] = full.detach().cpu().clone()
         return found
 
 
-class ShardedEngine(Engine):
-    """FSDP2: parameters, gradients and optimiser state sharded over ranks with `fully_shard`, block by block.
-
-    Called directly rather than through Accelerate, whose FSDP2 path does not exist on CPU; the same code then runs in
-    the tests and on GPUs.
-    """
-
-    name = "fsdp2"
-
-    def _wrap(self, model: PlaceModel, build: BuildOptimizer) -> None:
-        from torch.distributed.device_mesh import init_device_mesh
-        from torch.distributed.fsdp import MixedPrecisionPolicy, fully_shard
-
-        device = self.accelerator.device
-        self._template = copy.deepcopy(model)
-        model = model.to(device)
-        mesh = init_device_mesh(device.type, (world_size(),))
-        precision = {"bf16": torch.bfloat16, "fp16": torch.float16}.get(self.accelerator.mixed_precision)
-        policy = MixedPrecisionPolicy(param_dtype=precision, reduce_dtype=torch.float32) if precision else None
-        options: dict[str, Any] = {"mesh": mesh, **({"mp_policy": policy} if policy else {})}
-        for module in model.modules():
-            if isinstance(module, nn.ModuleList):
-                for block in module:
-                    if any(True for _ in block.parameters()):
-                        fully_shard(block, **options)
-        fully_shard(model, **options)
-        self.model = self.module = model
-        self.optimizer = build(model.parameters())
-
-    @contextmanager
-    def plain(self) -> Iterator[PlaceModel]:
-        # a sharded model cannot be called a different number of times on each rank, as evaluation does
-        sharded = self.module.state_dict()
-        self._template.to(self.accelerator.device)
-        with torch.no_grad():
-            for name, whole in self._template.state_dict().items():
-                whole.copy_(_whole(sharded[name]))
-        self._template.eval()
-        try:
-            yield self._template
-        finally:
-            self._template.to("cpu")
-
-
-def _whole(tensor: Any) -> Tensor:
+def whole(tensor: Any) -> Tensor:
     """The full tensor of a sharded one (collective); any other as it is."""
     full: Tensor = tensor.full_tensor() if hasattr(tensor, "full_tensor") else tensor
     return full
 
 
-def _like(value: Tensor, target: Any) -> Tensor:
+def placed_like(value: Tensor, target: Any) -> Tensor:
     """`value` placed as `target` is: device, dtype, and its shard where the target is sharded."""
     value = value.to(device=target.device, dtype=target.dtype)
     if hasattr(target, "full_tensor"):
@@ -219,10 +174,16 @@ def build_engine(
         UsageError: the engine cannot do what the config asks for.
     """
     chosen = choose(config.engine)
+    if chosen != "ddp" and config.compile:
+        raise UsageError(f"train.compile does not go with engine {chosen}, which swaps parameters under it; use DDP")
     if chosen == "deepspeed":
         from pipeline.training.zero import ZeroEngine
 
         return ZeroEngine(accelerator, model, build, config.clip, micro_batch)
-    if chosen == "fsdp2" and accelerator.mixed_precision == "fp16":
-        raise UsageError("engine fsdp2 has no loss scaler for fp16; use bf16, or DDP")
-    return (ShardedEngine if chosen == "fsdp2" else Engine)(accelerator, model, build, config.clip)
+    if chosen == "fsdp2":
+        if accelerator.mixed_precision == "fp16":
+            raise UsageError("engine fsdp2 has no loss scaler for fp16; use bf16, or DDP")
+        from pipeline.training.sharded import ShardedEngine
+
+        return ShardedEngine(accelerator, model, build, config.clip)
+    return Engine(accelerator, model, build, config.clip)
