@@ -27,7 +27,8 @@ from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights import frozen_hash, load_trainable, save_model
 from pipeline.training import checkpoint
 from pipeline.training.checkpoint import RunState
-from pipeline.training.engine import Engine, build_engine
+from pipeline.training.compiled import compile_backbone, uncompiled
+from pipeline.training.engine import Engine, build_engine, choose
 from pipeline.training.launch import stop_signals
 from pipeline.training.loss import MultiSimilarityLoss
 from pipeline.training.meter import Meter
@@ -79,6 +80,7 @@ class Trainer:
         model = build_model(config.model, config.data.image_size)
         self.backbone_hash = frozen_hash(model)
         self.state, optimizer = self._resume(model)
+        compile_backbone(model, config, choose(config.train.engine), accelerator.device)
         self.engine: Engine = build_engine(
             config.train,
             accelerator,
@@ -184,7 +186,7 @@ class Trainer:
     def _validate(self) -> None:
         """Recall of the model as it is; keeps the best, counts the epochs without a better one."""
         assert self.validation is not None
-        with self.engine.plain() as model:
+        with self.engine.plain() as model, uncompiled(self.config.train.compile):
             values, score = self.validation.run(model, self.main)
         self.state.validated = values
         self.tracker.metrics(values, self.state.step)
