@@ -160,9 +160,26 @@ def choose(setting: str) -> str:
     if setting != "auto" and launched == "deepspeed":
         raise UsageError(f"train.engine is {setting}, but accelerate was launched with DeepSpeed; set it to auto")
     chosen = launched if setting == "auto" else setting
-    if chosen == "fsdp2" and not is_distributed():
-        raise UsageError("engine fsdp2 shards over ranks and needs at least two; launch with --num_processes 2")
+    if chosen != "ddp" and not is_distributed():
+        raise UsageError(
+            f"engine {chosen} shards over ranks and needs at least two; launch with --num_processes 2, or one process "
+            "with jobs/accelerate/single.yaml (which continues the same checkpoints)"
+        )
+    if launched == "fsdp2":
+        _check_fsdp_plugin()
     return chosen
+
+
+def _check_fsdp_plugin() -> None:
+    """Refuses what the launcher's FSDP section asks for and this engine would silently not do."""
+    wrong = {
+        "FSDP_VERSION": ("1", "fsdp_version 1 is not supported; set fsdp_version: 2"),
+        "FSDP_OFFLOAD_PARAMS": ("true", "fsdp_offload_params is not supported; more ranks shard further"),
+        "FSDP_ACTIVATION_CHECKPOINTING": ("true", "fsdp_activation_checkpointing is train.encode_chunk here"),
+    }
+    for variable, (value, reason) in wrong.items():
+        if os.environ.get(variable, "").lower() == value:
+            raise UsageError(f"engine fsdp2: {reason}")
 
 
 def build_engine(
@@ -174,8 +191,6 @@ def build_engine(
         UsageError: the engine cannot do what the config asks for.
     """
     chosen = choose(config.engine)
-    if chosen != "ddp" and config.compile:
-        raise UsageError(f"train.compile does not go with engine {chosen}, which swaps parameters under it; use DDP")
     if chosen == "deepspeed":
         from pipeline.training.zero import ZeroEngine
 

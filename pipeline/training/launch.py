@@ -40,12 +40,15 @@ def start(timeout: float) -> Any:
     # strides that DDP remarks upon once, at no cost here
     warnings.filterwarnings("ignore", message=".*broadcast_buffers.*", category=FutureWarning)
     warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides.*")
+    # DeepSpeed calls collectives by names that torch 2.13 renames, once a step
+    warnings.filterwarnings("ignore", message=".*torch.distributed.*is deprecated", category=FutureWarning)
     cuda = torch.cuda.is_available() and os.environ.get("ACCELERATE_USE_CPU", "false").lower() != "true"
     deepspeed = os.environ.get("ACCELERATE_USE_DEEPSPEED", "false").lower() == "true"
     launched = int(os.environ.get("WORLD_SIZE", "1"))
     waiting = InitProcessGroupKwargs(timeout=timedelta(seconds=timeout))
     if deepspeed and not cuda:
         _deepspeed_on_cpu()
+        # without the name DeepSpeed looks for Intel's library and each process ends up alone
         waiting = InitProcessGroupKwargs(backend="gloo", timeout=timedelta(seconds=timeout))
     # the statistics of GlobalBatchNorm are the same on all ranks already: broadcasting them would only cost
     ddp = DistributedDataParallelKwargs(broadcast_buffers=False, gradient_as_bucket_view=True)
@@ -53,6 +56,11 @@ def start(timeout: float) -> Any:
         cpu=not cuda and not deepspeed,  # without it two launched CPU processes are two independent copies
         kwargs_handlers=[waiting, ddp],
     )
+    if accelerator.gradient_accumulation_steps != 1:
+        raise UsageError(
+            "gradient_accumulation_steps must be 1: the loss is over the global batch and not a sum over parts; to "
+            "save memory use train.encode_chunk"
+        )
     if accelerator.num_processes != launched or (launched > 1) != is_distributed():
         raise UsageError(
             f"{launched} processes were launched but this one is in a group of {accelerator.num_processes}; {ADVICE}"
