@@ -82,22 +82,25 @@ class ConvAdapter(nn.Module):
         paths: for each path its convolutions as (output channels, kernel).
         skip: whether the input of the paths is added to their output.
         norm: "batch", "group" or "none".
+        others: tokens that are no patches and skip the convolutions: the class token, and registers behind it.
     """
 
-    def __init__(self, dim: int, width: int, paths: list[list[tuple[int, int]]], skip: bool, norm: str) -> None:
+    def __init__(
+        self, dim: int, width: int, paths: list[list[tuple[int, int]]], skip: bool, norm: str, others: int = 1
+    ) -> None:
         super().__init__()
         self.down = nn.Linear(dim, width)
         self.paths = nn.ModuleList(_path(width, path, norm) for path in paths)
         self.up = nn.Linear(width, dim)
-        self.skip = skip
+        self.skip, self.others = skip, others
 
     def forward(self, x: Tensor) -> Tensor:
-        """[b, 1 + G*G, D] -> [b, 1 + G*G, D]."""
+        """[b, others + G*G, D] -> [b, others + G*G, D]."""
         hidden = torch.relu(self.down(x))
-        side = round((hidden.shape[1] - 1) ** 0.5)
-        grid = hidden[:, 1:].transpose(1, 2).unflatten(2, (side, side))  # [b, width, G, G]
+        side = round((hidden.shape[1] - self.others) ** 0.5)
+        grid = hidden[:, self.others :].transpose(1, 2).unflatten(2, (side, side))  # [b, width, G, G]
         maps = torch.cat([path(grid) for path in self.paths], dim=1)
-        mixed = torch.cat((hidden[:, :1], maps.flatten(2).transpose(1, 2).to(hidden.dtype)), dim=1)
+        mixed = torch.cat((hidden[:, : self.others], maps.flatten(2).transpose(1, 2).to(hidden.dtype)), dim=1)
         out: Tensor = self.up(mixed + hidden if self.skip else mixed)
         return out
 
@@ -122,8 +125,8 @@ def paths_of(kind: str, width: int, reduced: int) -> list[list[tuple[int, int]]]
     return [[(width, 1)]] if kernel == 1 else [[(reduced, 1), (width, kernel)]]
 
 
-def build_adapter(config: AdapterConfig, dim: int) -> nn.Module:
-    """One block's adapter for token width `dim`, initialised.
+def build_adapter(config: AdapterConfig, dim: int, others: int = 1) -> nn.Module:
+    """One block's adapter for token width `dim`, initialised; `others` tokens before the patches are no patches.
 
     Raises:
         UsageError: a bottleneck too narrow for its paths.
@@ -136,7 +139,7 @@ def build_adapter(config: AdapterConfig, dim: int) -> nn.Module:
         adapter = VanillaAdapter(dim, width)
     else:
         paths = paths_of(config.kind, width, config.reduced)
-        adapter = ConvAdapter(dim, width, paths, skip=config.kind != "conv", norm=config.norm)
+        adapter = ConvAdapter(dim, width, paths, skip=config.kind != "conv", norm=config.norm, others=others)
     _initialise(adapter, config.init)
     return adapter
 

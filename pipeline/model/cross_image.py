@@ -77,7 +77,7 @@ class CrossImageEncoder(nn.Module):
 
     def __init__(self, dim: int, config: CrossImageConfig) -> None:
         super().__init__()
-        if dim % config.heads:
+        if config.layers and dim % config.heads:
             raise UsageError(f"cross_image.heads {config.heads} does not divide the token width {dim}")
         self.layers = nn.ModuleList(CrossImageLayer(dim, config) for _ in range(config.layers))
 

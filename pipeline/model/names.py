@@ -21,9 +21,10 @@ RENAMES: list[tuple[re.Pattern[str], Any]] = [
     (re.compile(pattern), replacement)
     for pattern, replacement in [
         (r"^backbone\.vit\.encoder\.layer\.", "backbone.blocks."),
-        (r"^backbone\.vit\.layernorm\.", "backbone.norm."),
+        (r"^backbone\.vit\.(model\.)?layer\.", "backbone.blocks."),  # DINOv3, in both of transformers' layouts
+        (r"^backbone\.vit\.(layer)?norm\.", "backbone.norm."),
         (r"^backbone\.vit\.embeddings\.position_embeddings$", "backbone.pos_embed"),
-        (r"^backbone\.vit\.embeddings\.patch_embeddings\.projection\.", "backbone.patch_embed.proj."),
+        (r"^backbone\.vit\.embeddings\.patch_embeddings\.(projection\.)?", "backbone.patch_embed.proj."),
         (r"^backbone\.vit\.embeddings\.", "backbone."),
         (r"\.mlp\.(mlp|adapter)\.", lambda m: ".mlp." if m[1] == "mlp" else ".adapter."),
         (r"\.mlp\.(gate_proj|up_proj|weights_in)\.", ".mlp.w12."),

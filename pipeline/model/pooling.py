@@ -1,7 +1,8 @@
 """From patch tokens to regional features: the spatial pyramid, GeM, or the class token (paper, section 3.2).
 
 Invariant: regions come level by level, each level row by row; patch tokens are L2-normalised over channels before
-pooling, the class token is taken as it is; GeM's powers and means are float32 at least, also under autocast.
+pooling (unless `normalise` is off), the class token is taken as it is; GeM's powers and means are float32 at least,
+also under autocast.
 """
 
 from __future__ import annotations
@@ -51,8 +52,9 @@ class Pooling(nn.Module):
 
     members: Tensor
 
-    def __init__(self, config: PoolingConfig, grid: int) -> None:
+    def __init__(self, config: PoolingConfig, grid: int, dim: int = 0) -> None:
         super().__init__()
+        self.dim, self.normalise = dim, config.normalise
         levels = {"gem": (1,), "cls": ()}.get(config.kind, config.levels)
         if config.kind in ("spm", "spmg") and (not levels or min(levels) < 1 or max(levels) > grid):
             raise UsageError(f"pooling.levels {levels} must be numbers between 1 and the token grid's side {grid}")
@@ -74,7 +76,8 @@ class Pooling(nn.Module):
             return tokens[:, :1]
         with torch.autocast(tokens.device.type, enabled=False):
             p = at_least_float32(self.p)
-            powers = F.normalize(tokens[:, 1:], dim=-1, eps=1e-12).clamp(min=1e-6).pow(p)  # [b, G*G, D]
+            patches = F.normalize(tokens[:, 1:], dim=-1, eps=1e-12) if self.normalise else tokens[:, 1:]
+            powers = patches.clamp(min=1e-6).pow(p)  # [b, G*G, D]
             members = self.members.to(powers.dtype)  # one product for all cells: no backward pass per cell
             pooled = ((members @ powers) / members.sum(1, keepdim=True)).pow(1.0 / p)
         if self.class_at is None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -117,36 +118,110 @@ def _line(error: Exception) -> str:
     return text if len(text) < 160 else text[:157] + "..."
 
 
-def backbone_tensors(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
+def backbone_tensors(tensors: Mapping[str, Tensor], source: str, registers: bool = False) -> dict[str, Tensor]:
     """A DINOv2 backbone's tensors under published names, whatever naming they came in.
 
     Understood are the release's own names, a CricaVPR state dict (its backbone without adapters), and those of
     transformers, old and new.
 
     Raises:
-        UsageError: none of these, or a variant with register tokens.
+        UsageError: none of these, or register tokens where the backbone has none, or none where it has.
     """
-    if any("register_tokens" in name for name in tensors):
-        raise UsageError(f"{source}: a DINOv2 with register tokens; this backbone takes the variant without them")
+    found = any("register_tokens" in name for name in tensors)
+    if found != registers:
+        which = ("with", "without") if found else ("without", "with")
+        raise UsageError(
+            f"{source}: a DINOv2 {which[0]} register tokens; this backbone takes the variant {which[1]} them "
+            f"(backbone.name ending in _reg has them)"
+        )
     if "blocks.0.norm1.weight" in tensors:
         return {f"backbone.{name}": t for name, t in tensors.items()}
     if "backbone.blocks.0.norm1.weight" in tensors:
         return {n: t for n, t in tensors.items() if n.startswith("backbone.") and ".adapter." not in n}
-    bare = {name.removeprefix("dinov2."): t for name, t in tensors.items()}
+    prefixes = ("dinov2.", "dinov2_with_registers.")
+    bare = {name.removeprefix(prefixes[0]).removeprefix(prefixes[1]): t for name, t in tensors.items()}
     if "encoder.layer.0.norm1.weight" in bare:
         own = {f"backbone.vit.{n}": t for n, t in bare.items() if not n.startswith("classifier.")}
         return to_published(own)
     raise UsageError(f"{source}: no DINOv2 weights in it (first tensor: '{published_name(next(iter(bare)))[0]}')")
 
 
-def load_backbone(backbone: nn.Module, source: str, kind: str) -> None:
+def load_backbone(backbone: Any, source: str, kind: str) -> None:
     """Loads released weights, as float32, into a backbone without adapters (which may be on the meta device).
 
     Raises:
         UsageError: nothing at that path, or weights of another size; DataError: a broken file.
     """
-    tensors = backbone_tensors(read_tensors(source), source)
+    rope, registers = bool(backbone.rope), bool(backbone.registers)
+    given = read_tensors(source)
+    tensors = dinov3_tensors(given, source) if rope else backbone_tensors(given, source, registers)
     width = tensors["backbone.norm.weight"].shape[0] if "backbone.norm.weight" in tensors else 0
-    tensors.setdefault("backbone.mask_token", torch.zeros(1, width))  # unused; some exports leave it out
+    # unused; some exports leave it out
+    tensors.setdefault("backbone.mask_token", torch.zeros((1, 1, width) if rope else (1, width)))
     floats = {name: t.float() for name, t in tensors.items()}
     fit(backbone, floats, f"{source} (for backbone.name {kind})", prefix="backbone.", assign=True)
+
+
+# DINOv3's release -> transformers
+DINOV3_NAMES = [
+    (re.compile(pattern), replacement)
+    for pattern, replacement in [
+        (r"^storage_tokens$", "embeddings.register_tokens"),
+        (r"^(cls_token|mask_token)$", r"embeddings.\1"),
+        (r"^patch_embed\.proj\.", "embeddings.patch_embeddings."),
+        (r"^blocks\.", "layer."),
+        (r"\.attn\.proj\.", ".attention.o_proj."),
+        (r"\.ls([12])\.gamma$", r".layer_scale\1.lambda1"),
+        (r"\.mlp\.w1\.", ".mlp.gate_proj."),
+        (r"\.mlp\.(fc1|w2)\.", ".mlp.up_proj."),
+        (r"\.mlp\.(fc2|w3)\.", ".mlp.down_proj."),
+    ]
+]
+
+
+def dinov3_tensors(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
+    """A DINOv3 backbone's tensors under our file's names, from its release or from transformers.
+
+    The release fuses query, key and value; its keys have no bias (masked), and its rotary periods follow from the
+    config, so neither is read.
+
+    Raises:
+        UsageError: no DINOv3 in it.
+    """
+    if not any("register_tokens" in name or "storage_tokens" in name for name in tensors):
+        raise UsageError(f"{source}: no DINOv3 weights in it (they have register or storage tokens)")
+    own: dict[str, Tensor] = {}
+    for name, tensor in tensors.items():
+        if name.endswith(("bias_mask", "rope_embed.periods", "inv_freq")):
+            continue
+        if name == "mask_token":
+            tensor = tensor.reshape(1, 1, -1)
+        for pattern, replacement in DINOV3_NAMES:
+            name = pattern.sub(replacement, name)
+        fused = re.match(r"(layer\.\d+\.)attn\.qkv\.(weight|bias)$", name)
+        if fused is None:
+            own[f"backbone.vit.{name.removeprefix('dinov3_vit.').removeprefix('model.')}"] = tensor
+            continue
+        for part, piece in zip("qkv", tensor.chunk(3), strict=True):
+            if (part, fused[2]) != ("k", "bias"):
+                own[f"backbone.vit.{fused[1]}attention.{part}_proj.{fused[2]}"] = piece
+    return to_published(own)
+
+
+def load_resnet(backbone: nn.Module, source: str, kind: str) -> None:
+    """Loads torchvision-named weights, as float32, into a residual network; its classifier and unused stages stay out.
+
+    Raises:
+        UsageError: nothing at that path, or weights of another network; DataError: a broken file.
+    """
+    own = backbone.state_dict()
+    stages = {name.split(".")[0] for name in own}
+    tensors = {
+        f"backbone.{name}": t.float() if t.is_floating_point() else t
+        for name, t in read_tensors(source).items()
+        if not name.startswith("fc.") and (not name.startswith("layer") or name.split(".")[0] in stages)
+    }
+    for name in own:  # only counts batches; some exports leave it out
+        if name.endswith("num_batches_tracked"):
+            tensors.setdefault(f"backbone.{name}", torch.tensor(0))
+    fit(backbone, tensors, f"{source} (for backbone.name {kind})", prefix="backbone.", assign=True)

@@ -1,7 +1,8 @@
-"""The paper's model variants by the paper's names (tables on cross-image awareness, adaptation and kernels).
+"""The paper's model variants, and the baselines it is compared with, by name.
 
-Invariant: a variant is nothing but a few settings over the paper's model; every name gives a model that differs
-from `CricaVPR` in what the paper's table says and in nothing else.
+Invariant: a variant is nothing but a few settings over the paper's model; every name of `PAPER` gives a model that
+differs from `CricaVPR` in what the paper's table says and in nothing else. `BASELINES` are other methods over the same
+parts, each with its published sizes (docs/baselines.md).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ FROZEN: dict[str, Any] = {"adapter.kind": "none", "train": "frozen"}
 GEM: dict[str, Any] = {"pooling.kind": "gem"}
 SPMG: dict[str, Any] = {"pooling.kind": "spmg"}
 
-VARIANTS: dict[str, dict[str, Any]] = {
+PAPER: dict[str, dict[str, Any]] = {
     "CricaVPR": {},
     # ablation on cross-image awareness; +Crica adds the cross-image encoder
     "FrozenDINOv2-GeM": FROZEN | GEM | NO_CRICA,
@@ -48,6 +49,50 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
+def _resnet(cut: str, trained: int) -> dict[str, Any]:
+    """ResNet-50 up to a stage, of which the last `trained` stages are trained; no cross-image encoder."""
+    tuned: dict[str, Any] = {"adapter.kind": "none", "train": "last", "last_blocks": trained}
+    return tuned | NO_CRICA | {"backbone.name": "resnet50", "backbone.resnet.cut": cut}
+
+
+def _dinov2(trained: int) -> dict[str, Any]:
+    """The paper's backbone, of which the last blocks are trained instead of adapters; no cross-image encoder."""
+    return NO_CRICA | {"adapter.kind": "none", "train": "last", "last_blocks": trained}
+
+
+def _pool(kind: str, **fields: Any) -> dict[str, Any]:
+    return {"pooling.kind": kind} | {f"pooling.{kind}.{field}": value for field, value in fields.items()}
+
+
+RESNET_GEM = _resnet("layer4", 2) | GEM | {"pooling.normalise": False}
+BASELINES: dict[str, dict[str, Any]] = {
+    # on ResNet-50, as the paper compares them on the same training data (stages 1 and 2 frozen)
+    "NetVLAD": _resnet("layer3", 1) | _pool("netvlad"),
+    "GeM": RESNET_GEM,
+    "ResNet50-GeM": RESNET_GEM,
+    "CosPlace": _resnet("layer4", 2) | _pool("cosplace", dim=512),
+    "EigenPlaces": _resnet("layer4", 2) | _pool("cosplace", dim=2048),
+    "MixVPR": _resnet("layer3", 1) | _pool("mixvpr"),
+    "ResNet50-BoQ": _resnet("layer3", 1) | _pool("boq", channels=512),
+    "ResNet50-SPM": _resnet("layer4", 2),
+    "ResNet50-SPM+Crica": _resnet("layer4", 2) | {"cross_image.layers": 2},
+    # on DINOv2, what one would pick today
+    "SALAD": _dinov2(4) | _pool("salad"),
+    "BoQ": _dinov2(2) | _pool("boq"),
+    # the older aggregators on the paper's backbone: what the backbone alone is worth
+    "DINOv2-NetVLAD": _dinov2(4) | _pool("netvlad"),
+    "DINOv2-GeM": _dinov2(4) | GEM,
+    "DINOv2-CosPlace": _dinov2(4) | _pool("cosplace"),
+    "DINOv2-MixVPR": _dinov2(4) | _pool("mixvpr"),
+    # and the aggregators over the paper's adapters
+    "AdaptNetVLAD": NO_CRICA | _pool("netvlad"),
+    "AdaptSALAD": NO_CRICA | _pool("salad"),
+    "AdaptBoQ": NO_CRICA | _pool("boq"),
+}
+
+VARIANTS = PAPER | BASELINES
+
+
 def variant(name: str, base: ModelConfig | None = None) -> ModelConfig:
     """The config of a variant by the paper's name, over `base` (sizes, weights; the paper's model by default).
 
@@ -61,10 +106,10 @@ def variant(name: str, base: ModelConfig | None = None) -> ModelConfig:
         raise UsageError(f"unknown model variant '{name}'; {hint}")
     config = base or ModelConfig()
     for key, value in VARIANTS[name].items():
-        part, _, field = key.rpartition(".")
-        if part:
-            changed: Any = dataclasses.replace(getattr(config, part), **{field: value})
-            config = dataclasses.replace(config, **{part: changed})
-        else:
-            config = dataclasses.replace(config, **{field: value})
+        config = _changed(config, key.split("."), value)
     return config
+
+
+def _changed(config: Any, path: list[str], value: Any) -> Any:
+    inner = value if len(path) == 1 else _changed(getattr(config, path[0]), path[1:], value)
+    return dataclasses.replace(config, **{path[0]: inner})

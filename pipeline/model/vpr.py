@@ -12,11 +12,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pipeline.config import ModelConfig
+from pipeline.model.aggregators import build_pooling
 from pipeline.model.backbone import Backbone
 from pipeline.model.batch_norm import GlobalBatchNorm2d
 from pipeline.model.cross_image import CrossImageEncoder
 from pipeline.model.lockstep import in_step, recomputed
-from pipeline.model.pooling import Pooling, at_least_float32
+from pipeline.model.pooling import at_least_float32
+from pipeline.model.resnet import ResNet, is_resnet
 from shards.errors import UsageError
 
 
@@ -26,18 +28,19 @@ class PlaceModel(nn.Module):
     Attributes:
         config, image_size: what it was built from.
         regions: R, regional features of an image.
-        descriptor_dim: R * D, length of a descriptor.
+        descriptor_dim: R * D, length of a descriptor; D is the backbone's width, or the aggregator's where it has its
+            own (which is R = 1 for those that give one flat descriptor).
     """
 
     def __init__(self, config: ModelConfig, image_size: int) -> None:
         super().__init__()
         self.config = config
         self.image_size = image_size
-        self.backbone = Backbone(config, image_size)
-        self.pooling = Pooling(config.pooling, self.backbone.grid)
-        self.cross_image = CrossImageEncoder(self.backbone.dim, config.cross_image)
+        self.backbone: Backbone | ResNet = (ResNet if is_resnet(config.backbone.name) else Backbone)(config, image_size)
+        self.pooling = build_pooling(config.pooling, self.backbone.dim, self.backbone.grid)
+        self.cross_image = CrossImageEncoder(self.pooling.dim, config.cross_image)
         self.regions = self.pooling.regions
-        self.descriptor_dim = self.regions * self.backbone.dim
+        self.descriptor_dim = self.regions * self.pooling.dim
 
     def encode(self, images: Tensor, chunk: int | None = None) -> Tensor:
         """Regional features of normalised images: [b, 3, S, S] -> [b, R, D].
@@ -60,9 +63,12 @@ class PlaceModel(nn.Module):
             return self._regions(images)
         if chunk < 1:
             raise UsageError(f"train.encode_chunk {chunk} must be at least 1")
-        if self.training and any(isinstance(m, GlobalBatchNorm2d) for m in self.modules()):
-            with in_step(self.backbone, chunk):
-                tokens = self.backbone(images)
+        if any(isinstance(m, GlobalBatchNorm2d) and m.training for m in self.modules()):
+            if isinstance(self.backbone, ResNet):
+                tokens = self.backbone(images, recompute=True)
+            else:
+                with in_step(self.backbone, chunk):
+                    tokens = self.backbone(images)
             return torch.cat([recomputed(self.pooling, part) for part in tokens.split(chunk)])
         return torch.cat([recomputed(self._regions, part) for part in images.split(chunk)])
 

@@ -47,7 +47,7 @@ def preview(config: RunConfig) -> list[tuple[str, str]]:
     model = build_model(config.model, config.data.image_size)
     counts = parameter_counts(model)
     rows += [
-        ("descriptor", f"{model.regions} regions x {model.backbone.dim} = {model.descriptor_dim} dimensions"),
+        ("descriptor", f"{model.regions} regions x {model.pooling.dim} = {model.descriptor_dim} dimensions"),
         ("parameters", f"{counts['total']:,}: {counts['trainable']:,} trained, "
                        f"{counts['total'] - counts['trainable']:,} frozen"),
     ]  # fmt: skip

@@ -1,0 +1,90 @@
+"""NetVLAD (Arandjelovic et al., CVPR 2016): sums of residuals to softly assigned cluster centres.
+
+Invariant: patch features are L2-normalised; the K residual sums are L2-normalised each (intra-normalisation) before
+the whole is; the order of the patches does not matter. Parameters are named as in the common PyTorch releases.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pipeline.baseline_config import NetVLADConfig
+from pipeline.model.pooling import at_least_float32
+
+
+class NetVLAD(nn.Module):
+    """Tokens [b, 1 + N, D] -> K residual sums of unit length [b, K, D].
+
+    Each is a region of its own: the cross-image encoder may follow. The centres should be set by `cluster` before
+    training; without, they are random.
+    """
+
+    def __init__(self, config: NetVLADConfig, dim: int) -> None:
+        super().__init__()
+        self.config, self.regions, self.dim = config, config.clusters, dim
+        self.conv = nn.Conv2d(dim, config.clusters, 1, bias=False)
+        self.centroids = nn.Parameter(torch.rand(config.clusters, dim))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """[b, 1 + N, D] -> [b, K, D]."""
+        with torch.autocast(tokens.device.type, enabled=False):
+            x = F.normalize(at_least_float32(tokens[:, 1:]), dim=-1)
+            weight, centres = self.conv.weight.flatten(1).to(x.dtype), self.centroids.to(x.dtype)
+            assigned = F.linear(x, weight).softmax(dim=-1)  # [b, N, K]
+            # sum of a (x - c) over patches, without the [b, N, K, D] of residuals
+            residuals = assigned.transpose(1, 2) @ x - assigned.sum(1).unsqueeze(-1) * centres
+            return F.normalize(residuals, dim=-1)
+
+    @torch.no_grad()
+    def cluster(self, features: Tensor, seed: int, iterations: int = 50) -> None:
+        """Sets centres and assignment from patch features [n, D] by k-means, as published.
+
+        The assignment's sharpness alpha makes the nearest centre 100 times as likely as the second nearest, on
+        average over the features: alpha = -log(0.01) / mean(similarity of nearest - of second).
+        """
+        x = F.normalize(at_least_float32(features), dim=-1)
+        centres = k_means(x, self.regions, seed, iterations)
+        directions = F.normalize(centres, dim=-1)
+        alpha = 1.0
+        if self.regions > 1:
+            nearest = (x @ directions.T).topk(2, dim=-1).values
+            alpha = -math.log(0.01) / max(float((nearest[:, 0] - nearest[:, 1]).mean()), 1e-6)
+        self.centroids.copy_(centres)
+        self.conv.weight.copy_((alpha * directions)[:, :, None, None])
+
+
+def k_means(points: Tensor, clusters: int, seed: int, iterations: int = 50) -> Tensor:
+    """Lloyd's algorithm from k-means++ starts: points [n, D] -> centres [clusters, D]. Ends early when settled.
+
+    An emptied cluster restarts at the point farthest from its centre. With fewer points than clusters, points repeat.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    n = len(points)
+    chosen = [int(torch.randint(n, (1,), generator=generator))]
+    distance = (points - points[chosen[0]]).square().sum(-1)
+    while len(chosen) < clusters:
+        weights = distance.double().cpu().clamp(min=0)
+        if not float(weights.sum()) > 0:
+            weights = torch.ones_like(weights)  # all points are centres already
+        chosen.append(int(torch.multinomial(weights, 1, generator=generator)))
+        distance = torch.minimum(distance, (points - points[chosen[-1]]).square().sum(-1))
+    centres = points[chosen].clone()
+    owners = torch.full((n,), -1, device=points.device)
+    for _ in range(iterations):
+        scores = 2 * points @ centres.T - centres.square().sum(-1)
+        best = scores.max(-1)
+        if torch.equal(best.indices, owners):
+            break
+        owners = best.indices
+        counts = torch.bincount(owners, minlength=clusters)
+        sums = torch.zeros_like(centres).index_add_(0, owners, points)
+        centres = torch.where(counts[:, None] > 0, sums / counts.clamp(min=1)[:, None], centres)
+        empty = (counts == 0).nonzero().flatten()
+        if len(empty) and len(empty) < n:
+            farthest = (points.square().sum(-1) - best.values).topk(len(empty)).indices
+            centres[empty] = points[farthest]
+    return centres
