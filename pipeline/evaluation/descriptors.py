@@ -150,6 +150,18 @@ def encode(
     return regions
 
 
+def describe_alone(model: nn.Module, photo: Path, resize: Any, precision: Any, device: torch.device) -> np.ndarray:
+    """The descriptor [1, dim] of one photo, in a forward pass of its own: other photos cannot even change its rounding.
+
+    For a model in `evaluating`. Raises `DataError` naming a broken photo.
+    """
+    images = to_input(load_image(photo), int(model.image_size), resize)[None]  # type: ignore[arg-type]
+    config = EvaluationConfig(precision=precision)
+    regions = _forward(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
+    described: np.ndarray = model.correlate(regions).float().cpu().numpy()  # type: ignore[operator]
+    return described
+
+
 def correlate(
     model: nn.Module,
     regions: Regions,

@@ -145,6 +145,34 @@ def retrieval_grid(
                 _photo(place(row, columns - 1), evaluated.database[positive], tile, BLUE, "a positive", where)
 
 
+def answer_grid(rows: Sequence[tuple[Path, Sequence[tuple[Path, str]]]], path: Path, title: str, below: str) -> None:
+    """A row for each photo that asked: the photo, then its (answer, label) pairs; nobody knows which are right.
+
+    Labels have one or two lines: above and below the answer; without a second line its name is below. An answer whose
+    file is no longer there leaves an empty tile that says so.
+    """
+    columns = 1 + max(len(answers) for _, answers in rows)
+    tile = (TILE, round(TILE / _aspect([photo for photo, _ in rows])))
+    wide, gap, label, head = 1.95, 0.14, 0.44, 0.86
+    high = wide * tile[1] / tile[0]
+    width, height = max(5.0, gap + columns * (wide + gap)), head + len(rows) * (high + label)
+    with _canvas(width, height, path, layout="none") as figure:
+        figure.text(gap / width, 1 - 0.14 / height, title, fontsize=14, fontweight="bold", va="top")
+        figure.text(gap / width, 1 - 0.42 / height, below, fontsize=9.5, color=GREY, va="top")
+        for row, (photo, answers) in enumerate(rows):
+            shown = [(photo, INK, "where is this?", _short(photo))]
+            for rank, (file, text) in enumerate(answers, 1):
+                above, _, note = text.partition("\n")
+                shown.append((file, BLUE, f"{rank}   {above}", note or _short(file)))
+            for column, (file, colour, text, note) in enumerate(shown):
+                left, top = gap + column * (wide + gap), head + row * (high + label)
+                box = (left / width, 1 - (top + high) / height, wide / width, high / height)
+                if file.is_file():
+                    _photo(figure.add_axes(box), file, tile, colour, text, note)
+                else:
+                    figure.text(box[0], box[1] + box[3] / 2, f"{text}\n(no longer there)", fontsize=8, color=GREY)
+
+
 def recall_curves(curves: Mapping[str, np.ndarray], path: Path, title: str, below: str = "") -> None:
     """Recall@N over N, one line for each name (a protocol, a run): percent [n] for N = 1 ... n (`curve_of`)."""
     with _canvas(7.4, 4.6, path) as figure:

@@ -63,6 +63,24 @@ def from_manifest(path: Path, config: EvaluationConfig) -> EvaluationSet:
     return EvaluationSet(clean_name(path.stem), photos[0], photos[1], positives, rule, of_database, of_queries)
 
 
+def read_photos(path: Path) -> tuple[list[Path], np.ndarray | None, str]:
+    """The photos of a manifest that need not be a set: paths, positions [n, 2] or None, and what these are.
+
+    Coordinates: `utm` (east, north in metres), `degrees` (latitude, longitude), or `none`. Only `image` is needed;
+    where there is a `role`, the rows of role database count. Raises `DataError` for missing photos or values.
+    """
+    rows = _read(path)
+    if rows and "role" in rows[0]:
+        rows = [row for row in rows if row["role"] == "database"]
+    if not rows or "image" not in rows[0]:
+        raise DataError(f"{path}: no photos in it; expected a column image, and utm_east and utm_north, or lat and lon")
+    photos = existing([path.parent / str(row["image"]) for row in rows], str(path))
+    for kind, (first, second) in {"degrees": ("lat", "lon"), "utm": ("utm_east", "utm_north")}.items():
+        if {first, second} <= rows[0].keys():
+            return photos, np.stack([_numbers(path, rows, first), _numbers(path, rows, second)], axis=1), kind
+    return photos, None, "none"
+
+
 def _read(path: Path) -> list[dict[str, Any]]:
     try:
         if path.suffix.lower() == ".parquet":

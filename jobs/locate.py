@@ -1,0 +1,160 @@
+"""Where was this photo taken? Answers from an index of your own photos, with or without positions.
+
+    python -m jobs.locate --checkpoint outputs/RUN --build PHOTOS --index my-index
+    python -m jobs.locate --checkpoint outputs/RUN --index my-index --photos A.jpg B.jpg
+
+PHOTOS is a folder (names may carry `@UTM_east@UTM_north@`) or a manifest: .csv or .parquet with `image` and, if known,
+`lat` and `lon` or `utm_east` and `utm_north`. Both at once build and then ask. Answers are printed and written to
+`<index>/answers/`: answers.json, and the photos beside their answers in answers.jpg.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from jobs.cli import parse, run_job
+from shards.errors import UsageError
+
+SHOWN = 12  # photos that ask, in the picture; the text and the JSON have all
+
+
+@dataclass(frozen=True)
+class LocateJob:
+    """Build an index of photos, ask it, or both."""
+
+    checkpoint: str = ""
+    """A run folder (its best checkpoint), a checkpoint folder, a .safetensors file, or a released CricaVPR .pth."""
+    index: str = ""
+    """Folder of the index; belongs to the checkpoint that made it."""
+    photos: tuple[str, ...] = ()
+    """Photos to be located, or folders of them."""
+    build: str | None = None
+    """Folder of photos, or manifest, to make the index of."""
+    answers: int = 5
+    """Places shown a photo."""
+    output: str | None = None
+    """Folder of the answers; none: `<index>/answers`."""
+    search: Literal["exact", "ivfpq", "hnsw"] = "exact"
+    """Building: exact search, or an approximate one for very many photos."""
+    pca: int | None = None
+    """Building: dimensions kept by PCA of the index's own photos; none keeps all."""
+    resize: Literal["antialias", "published"] = "antialias"
+    """Building: antialias as in training; published: normalise, then resize without."""
+    precision: Literal["fp32", "bf16", "fp16"] = "fp32"
+    """Building: autocast of the per-image part."""
+    batch: int = 32
+    """Building: images a forward pass."""
+    workers: int = 4
+    """Building: decoding processes."""
+    device: str = "auto"
+    """auto (a GPU where there is one), cpu, cuda, cuda:1 ..."""
+    figures: bool = True
+    """Draw answers.jpg."""
+
+
+def main() -> None:
+    """Parses, builds where asked to, answers where asked to."""
+    job = parse(LocateJob, __doc__ or "", photo_words(sys.argv[1:]))
+    for name, example in (("checkpoint", "outputs/cricavpr"), ("index", "my-index")):
+        if not getattr(job, name):
+            raise UsageError(f"--{name} is missing: for example --{name} {example}")
+    if not job.build and not job.photos:
+        raise UsageError("nothing to do: give --photos to be located, or --build PHOTOS to make the index")
+    if job.answers < 1:
+        raise UsageError(f"--answers is {job.answers}; it must be at least 1")
+    run(job)
+
+
+def photo_words(argv: Sequence[str]) -> list[str]:
+    """`--photos A.jpg B.jpg` as one list for the parser, whatever characters the names hold."""
+    words = list(argv)
+    if "--photos" not in words:
+        return words
+    first = words.index("--photos") + 1
+    last = next((i for i in range(first, len(words)) if words[i].startswith("--")), len(words))
+    return [*words[:first], json.dumps(words[first:last]), *words[last:]]
+
+
+def run(job: LocateJob) -> None:
+    """The work itself."""
+    import torch
+
+    from pipeline.config import EvaluationConfig
+    from pipeline.evaluation.evaluate import model_fingerprint
+    from pipeline.evaluation.locate import locate, make_index, open_index
+    from pipeline.model.weights import checkpoint_file, load_model, load_published
+
+    photos = asked(job.photos)
+    device = job.device if job.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+    file, folder = checkpoint_file(job.checkpoint), Path(job.index)
+    model = load_published(file).to(device) if file.suffix == ".pth" else load_model(file, device)
+    fingerprint = model_fingerprint(model)
+    if job.build:
+        config = EvaluationConfig(resize=job.resize, precision=job.precision, search=job.search, pca=job.pca,
+                                  batch=job.batch, workers=job.workers)  # fmt: skip
+        index = make_index(model, Path(job.build), folder, config, device, fingerprint, {"checkpoint": str(file)})
+        where = {"none": "without positions", "utm": "with UTM positions", "degrees": "with latitude and longitude"}
+        print(f"{folder}: {len(index.photos):,} photos {where[index.coordinates]}, {index.index.d:,} numbers each, "
+              f"{job.search} search, {index.about['bytes'] / 1e6:,.1f} MB")  # fmt: skip
+    else:
+        index = open_index(folder, fingerprint)
+    if photos:
+        tell(job, index, locate(model, index, photos, job.answers, device))
+
+
+def asked(given: Sequence[str]) -> list[Path]:
+    """The photos of the command line, folders unfolded. Raises `UsageError` for what is not there."""
+    from pipeline.evaluation.evaluation_set import list_images
+
+    photos: list[Path] = []
+    for path in map(Path, given):
+        if not path.exists():
+            raise UsageError(f"{path}: no such photo")
+        photos += list_images(path) if path.is_dir() else [path]
+    return photos
+
+
+def tell(job: LocateJob, index: object, answers: Sequence[object]) -> None:
+    """Prints the answers and writes them down."""
+    from pipeline.evaluation import figures
+    from pipeline.evaluation.locate import Answer, PhotoIndex, place_text
+
+    assert isinstance(index, PhotoIndex)
+    root = index.about["root"]
+    print(f"answers are photos below {root}\n")
+    rows, pictured = [], []
+    for answer in answers:
+        assert isinstance(answer, Answer)
+        print(answer.photo)
+        notes = []
+        for rank, (place, far, position) in enumerate(
+            zip(answer.places, answer.distances, answer.positions, strict=True), 1
+        ):
+            where = place_text(position, index.coordinates)
+            shown = place.relative_to(root) if place.is_relative_to(root) else place
+            print(f"  {rank:>2}  distance {far:.3f}  {shown}  {where}".rstrip())
+            notes.append((place, f"distance {far:.3f}\n{where}"))
+        rows.append(answer.to_dict(index.coordinates))
+        pictured.append((answer.photo, notes))
+    output = Path(job.output) if job.output else index.folder / "answers"
+    output.mkdir(parents=True, exist_ok=True)
+    about = {"index": str(index.folder), "fingerprint": index.about["fingerprint"], "protocol": index.about["protocol"]}
+    (output / "answers.json").write_text(json.dumps({**about, "photos": rows}, indent=2) + "\n")
+    written = [output / "answers.json"]
+    if job.figures:
+        below = (
+            f"{len(index.photos):,} photos in {index.folder.name} · {index.protocol.search} search · each photo alone"
+        )
+        left = f", the first {SHOWN} of {len(pictured)}" if len(pictured) > SHOWN else ""
+        figures.answer_grid(pictured[:SHOWN], output / "answers.jpg", f"The most similar places{left}", below)
+        written.append(output / "answers.jpg")
+    print("\nwritten: " + "  ".join(map(str, written)))
+
+
+if __name__ == "__main__":
+    run_job(main)
