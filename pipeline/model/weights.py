@@ -29,7 +29,10 @@ PUBLISHED_SIZE = 224
 
 
 def from_published(
-    state_dict: Mapping[str, Any], source: str = "the state dict", image_size: int = PUBLISHED_SIZE
+    state_dict: Mapping[str, Any],
+    source: str = "the state dict",
+    image_size: int = PUBLISHED_SIZE,
+    config: ModelConfig | None = None,
 ) -> PlaceModel:
     """The paper's model from a released CricaVPR state dict, in eval mode.
 
@@ -38,6 +41,7 @@ def from_published(
             checkpoint (`model_state_dict`). float64 tensors stay float64, all others become float32.
         source: what an error message calls it.
         image_size: side of the input in pixels; the position embedding is resized to it.
+        config: a model of published names and other sizes; the paper's by default.
 
     Raises:
         UsageError: missing or surplus names, or other shapes.
@@ -46,7 +50,7 @@ def from_published(
         name: t if t.dtype == torch.float64 or not t.is_floating_point() else t.float()
         for name, t in unwrap(state_dict, source).items()
     }
-    model = _without_weights(ModelConfig(), image_size)
+    model = _without_weights(config or ModelConfig(), image_size)
     fit(model, given, source, assign=True)
     return model.eval()
 

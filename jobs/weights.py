@@ -1,0 +1,132 @@
+"""Weights in and out: says what a file is, imports released weights, writes files that stand alone.
+
+    python -m jobs.weights --source dinov2_vitb14_pretrain.pth --to weights/dinov2_vitb14.safetensors
+    python -m jobs.weights --source CricaVPR.pth --to weights/cricavpr.safetensors
+    python -m jobs.weights --source outputs/RUN --to weights/mine.safetensors
+    python -m jobs.weights --source outputs/RUN --to weights/mine.onnx
+
+The ending of --to decides what is written: .safetensors (everything, with the config inside), .pth (published names,
+tensors alone), .onnx (the per-image path, checked by onnxruntime against torch). Without --to it only tells what the
+source is. Pickles are read as tensors alone; foreign code is never run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from jobs.cli import parse, run_job
+from pipeline.config import ModelConfig
+from shards.errors import UsageError
+
+if TYPE_CHECKING:
+    from pipeline.model.vpr import PlaceModel
+
+ENDINGS = (".safetensors", ".pth", ".onnx")
+
+
+@dataclass(frozen=True)
+class WeightsJob:
+    """Describe, import or export weights."""
+
+    source: str = ""
+    """A run or checkpoint folder, a file of ours, a released CricaVPR or DINOv2 .pth, a transformers folder or hub
+    name."""
+    to: str = ""
+    """The file to write: .safetensors, .pth or .onnx; none: only tell what the source is."""
+    kind: Literal["auto", "model", "cricavpr", "backbone"] = "auto"
+    """What the source must be; auto looks."""
+    image_size: int | None = None
+    """Side of the input in pixels; none: what the file says, 224 for released weights."""
+    variant: str = ""
+    """For a backbone: write the whole model of the paper's variant around it, untrained."""
+    onnx: Literal["descriptors", "regions"] = "descriptors"
+    """.onnx: descriptors with each image as its own group, or the regional features before the cross-image encoder."""
+    model: ModelConfig = field(default_factory=ModelConfig)
+    """Sizes where released weights are not the paper's; a backbone's name is found by its width and depth."""
+
+
+def main() -> None:
+    """Parses, reads, tells, writes."""
+    job = parse(WeightsJob, __doc__ or "")
+    if not job.source:
+        raise UsageError("--source is missing: a run folder, a file of ours, or released weights")
+    target = Path(job.to) if job.to else None
+    if target is not None and target.suffix not in ENDINGS:
+        raise UsageError(f"--to {job.to}: the ending decides what is written; give one of {', '.join(ENDINGS)}")
+    if target is not None and target.exists() and target.resolve() == Path(job.source).expanduser().resolve():
+        raise UsageError(f"--to {job.to} is the source itself; give another file")
+    from pipeline.model import exchange
+
+    found = exchange.kind_of(job.source)
+    kind = found if job.kind == "auto" else job.kind
+    if kind == "model" and found != "model":
+        raise UsageError(f"{job.source}: not {exchange.KINDS['model']} but {exchange.KINDS[found]}")
+    if kind == "backbone" and not job.variant:
+        _backbone(job, target, exchange.KINDS[found])
+        return
+    if kind == "backbone":
+        from pipeline.model.variants import variant
+
+        config = variant(job.variant, job.model)
+        backbone = exchange.fitting_backbone(job.source, config.backbone)
+        config = dataclasses.replace(config, backbone=backbone)
+        model = exchange.around_backbone(job.source, config, job.image_size)
+    else:
+        model = exchange.read_model(job.source, kind, job.model, job.image_size)
+    print(f"{job.source}: {exchange.KINDS[found]}")
+    _describe(model)
+    if target is not None:
+        _write(model, target, job)
+
+
+def _backbone(job: WeightsJob, target: Path | None, what: str) -> None:
+    """Tells what backbone it is, and writes it under the release's names."""
+    from pipeline.model import exchange
+
+    config = exchange.fitting_backbone(job.source, job.model.backbone)
+    print(f"{job.source}: {what}; its backbone is {config.name}")
+    if target is None:
+        return
+    if target.suffix != ".safetensors":
+        raise UsageError(f"--to {job.to}: a backbone alone is written as .safetensors; --variant NAME makes it a model")
+    tensors = exchange.write_backbone(job.source, config, target)
+    numbers = sum(tensor.numel() for tensor in tensors.values())
+    print(f"  {len(tensors)} tensors, {numbers:,} numbers, read back and equal")
+    _wrote(target, f"use it as --model.backbone.name {config.name} --model.backbone.weights {target}")
+
+
+def _describe(model: PlaceModel) -> None:
+    from pipeline.model.vpr import parameter_counts
+
+    counts = parameter_counts(model)
+    print(f"  {model.image_size} px -> {model.descriptor_dim:,} numbers ({model.regions} regions)")
+    print(f"  parameters: {', '.join(f'{name} {count:,}' for name, count in counts.items())}")
+
+
+def _write(model: PlaceModel, target: Path, job: WeightsJob) -> None:
+    from pipeline.model import exchange
+
+    if target.suffix == ".onnx":
+        from pipeline.model.onnx_export import export_onnx
+
+        difference = export_onnx(model, target, job.onnx)
+        print(f"  onnxruntime against torch, 1 and 3 images: largest difference {difference:.1e}")
+        _wrote(target, f"input 'images' [batch, 3, {model.image_size}, {model.image_size}], output '{job.onnx}'")
+    elif target.suffix == ".pth":
+        exchange.write_published(model, target)
+        _wrote(target, "published names, tensors alone")
+    else:
+        exchange.write_model(model, target, job.source)
+        _wrote(target, f"load_model('{target}'), or --checkpoint {target} in jobs.evaluate")
+
+
+def _wrote(target: Path, how: str) -> None:
+    size = sum(f.stat().st_size for f in (target, target.with_name(target.name + ".data")) if f.is_file())
+    print(f"wrote {target} ({size / 1e6:,.1f} MB): {how}")
+
+
+if __name__ == "__main__":
+    run_job(main)
