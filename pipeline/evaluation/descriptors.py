@@ -1,8 +1,9 @@
 """Descriptors of a set of images, computed by all processes together: `encode` once an image, `correlate` per group.
 
 Invariant: W never changes a descriptor. Forward batches of the per-image part and groups of the cross-image encoder
-are both cut from positions in the dataset, then dealt to ranks whole; a group is always one call of `correlate`. So
-ranks even agree to the last bit on like hardware, where cutting batches per rank would leave rounding differences.
+are both cut from positions in the dataset, then dealt to ranks whole; a group is always one call of `correlate`, and
+groups of one image are called many together (`calls_of`), cut by position too. So ranks even agree to the last bit on
+like hardware, where cutting batches per rank would leave rounding differences.
 
 The regions [R, D] of an image are computed once and kept (memory, or a file for large sets) by the ranks whose
 groups need them, so that all groupings cost one pass of the backbone. Sharded engines (FSDP2, ZeRO-3) need every
@@ -29,6 +30,7 @@ from pipeline.data.images import load_image, normalise, to_input
 from shards.errors import DataError
 from shards.progress import Progress
 
+ALONE = 64  # images correlated in one call where each is a group of its own
 BLOCK_BYTES = 64 * 2**20  # descriptors handed over at once: the memory of a gather, and the size of a stored part
 REGIONS_IN_MEMORY = 4 * 2**30  # bytes of regions a rank keeps in memory before it turns to a file
 TOLD = 5_000  # images from which the second step, quick beside the backbone, has a progress line of its own
@@ -47,6 +49,14 @@ def blocks_of(groups: Sequence[np.ndarray], dim: int, limit: int = BLOCK_BYTES) 
         blocks[-1].append(group)
         rows += len(group)
     return blocks
+
+
+def calls_of(groups: list[np.ndarray], model: Any) -> tuple[list[np.ndarray], bool]:
+    """(What is correlated in a call, whether its images are groups of one each): the groups, one a call; but of groups
+    of one image `ALONE` together, where the model can. Cut by position, so the number of processes changes nothing."""
+    if max(map(len, groups)) > 1 or not getattr(model, "correlates_alone", False):
+        return groups, False
+    return [np.concatenate(groups[first : first + ALONE]) for first in range(0, len(groups), ALONE)], True
 
 
 class _Batches(torch.utils.data.Dataset[tuple[Tensor, str]]):
@@ -171,6 +181,7 @@ def correlate(
     done: frozenset[int] = frozenset(),
     label: str = "correlating",
     progress: bool = True,
+    alone: bool = False,
 ) -> None:
     """Runs the cross-image encoder over groups. Collective.
 
@@ -178,11 +189,13 @@ def correlate(
         model: has `correlate(regions [n, R, D]) -> descriptors [n, dim]`, of one group.
         keep: called on rank 0 alone with (number of the block, positions [n], descriptors [n, dim]).
         done: numbers of blocks that are stored already; the same on all ranks.
+        alone: the blocks' "groups" are calls of many groups of one image each (`calls_of`).
     """
     w, r = distributed.world_size(), distributed.rank()
     todo = [number for number in range(len(blocks)) if number not in done]
     total = sum(len(group) for number in todo for group in blocks[number])
     shape = regions.values.shape[1:]
+    together = {"alone": True} if alone else {}
     with Progress(label, total, "images", enabled=progress and r == 0 and total >= TOLD) as bar:
         for number in todo:
             block = blocks[number]
@@ -190,7 +203,7 @@ def correlate(
             for call in range(-(-len(block) // w)):
                 j = call * w + r
                 group = regions.take(block[j]) if j < len(block) else _zeros(shape, regions.values.dtype)
-                described = model.correlate(group.to(device))  # type: ignore[operator]
+                described = model.correlate(group.to(device), **together)  # type: ignore[operator]
                 own.append(described if j < len(block) else described[:0])
             gathered = distributed.gather_uneven(torch.cat(own))
             if r == 0:

@@ -20,7 +20,7 @@ import torch
 
 from pipeline import distributed
 from pipeline.config import EvaluationConfig, to_dict
-from pipeline.evaluation.descriptors import Block, Regions, blocks_of, correlate, encode
+from pipeline.evaluation.descriptors import Block, Regions, blocks_of, calls_of, correlate, encode
 from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.protocol import Protocol, Side
 from pipeline.evaluation.retrieval import Blocks, slices
@@ -48,7 +48,8 @@ class Engine:
         """Encodes one side of a set, unless the store holds all of it under the `chosen` protocols."""
         paths = evaluated.database if side == "database" else evaluated.queries
         dim = int(self.model.descriptor_dim)
-        blocks = {p: blocks_of(p.form(len(paths), side), dim) for p in chosen}
+        calls = {p: calls_of(p.form(len(paths), side), self.model) for p in chosen}
+        blocks = {p: blocks_of(groups, dim) for p, (groups, _) in calls.items()}
         files = ""
         writers: dict[Protocol, StoreWriter] = {}
 
@@ -75,7 +76,9 @@ class Engine:
                 f"{self.fingerprint} {files} {[p.grouping.name for p in missing]}" if self.fingerprint else "",
                 self.progress,
             )
-        return DescribedSide(self, f"{evaluated.name} {side}", len(paths), blocks, writers, done, regions, scratch)
+        alone = {p: together for p, (_, together) in calls.items()}
+        label = f"{evaluated.name} {side}"
+        return DescribedSide(self, label, len(paths), blocks, alone, writers, done, regions, scratch)
 
     def _writer(self, evaluated: EvaluationSet, side: Side, protocol: Protocol, files: str, parts: int) -> StoreWriter:
         of_database = side == "database"
@@ -100,6 +103,8 @@ class DescribedSide:
     label: str
     rows: int
     blocks: dict[Protocol, list[Block]]
+    alone: dict[Protocol, bool]
+    """Whether a block's calls are of groups of one image each."""
     writers: dict[Protocol, StoreWriter]
     """Empty on ranks other than 0, and without a store."""
     done: dict[Protocol, frozenset[int]]
@@ -122,6 +127,7 @@ class DescribedSide:
                 self.done.get(protocol, frozenset()),
                 f"{self.label}: {protocol.grouping.name}",
                 self.engine.progress,
+                self.alone[protocol],
             )
         if writer is not None:
             return DescriptorStore(writer.folder).blocks

@@ -29,9 +29,16 @@ class CrossImageAttention(nn.Module):
         nn.init.xavier_uniform_(self.in_proj_weight)
         nn.init.zeros_(self.out_proj.bias)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """[b, R, D] -> [b, R, D]: each region's b images (queries) over that region's B images (keys, values)."""
+    def forward(self, x: Tensor, alone: bool = False) -> Tensor:
+        """[b, R, D] -> [b, R, D]: each region's b images (queries) over that region's B images (keys, values).
+
+        `alone`: every image over itself only. The softmax over one key is 1, so what is attended to is the value.
+        """
         dim = x.shape[-1]
+        if alone:
+            value = F.linear(x, self.in_proj_weight[2 * dim :], self.in_proj_bias[2 * dim :])
+            itself: Tensor = self.out_proj(value)
+            return itself
         query, key_value = F.linear(x, self.in_proj_weight, self.in_proj_bias).split((dim, 2 * dim), dim=-1)
         if self.training:
             # projected on the rank that owns the image, then gathered once: the projection is not repeated W times
@@ -60,9 +67,9 @@ class CrossImageLayer(nn.Module):
         self.norm2 = nn.LayerNorm(dim)
         self.dropout = nn.Dropout(config.dropout)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """[b, R, D] -> [b, R, D]."""
-        x = self.norm1(x + self.dropout(self.self_attn(x)))
+    def forward(self, x: Tensor, alone: bool = False) -> Tensor:
+        """[b, R, D] -> [b, R, D]; `alone` as in the attention."""
+        x = self.norm1(x + self.dropout(self.self_attn(x, alone)))
         hidden = self.dropout(F.gelu(self.linear1(x)))
         out: Tensor = self.norm2(x + self.dropout(self.linear2(hidden)))
         return out
@@ -81,8 +88,8 @@ class CrossImageEncoder(nn.Module):
             raise UsageError(f"cross_image.heads {config.heads} does not divide the token width {dim}")
         self.layers = nn.ModuleList(CrossImageLayer(dim, config) for _ in range(config.layers))
 
-    def forward(self, regions: Tensor) -> Tensor:
-        """[b, R, D] -> [b, R, D]."""
+    def forward(self, regions: Tensor, alone: bool = False) -> Tensor:
+        """[b, R, D] -> [b, R, D]; `alone`: of b groups of one image each, not of one group."""
         for layer in self.layers:
-            regions = layer(regions)
+            regions = layer(regions, alone)
         return regions

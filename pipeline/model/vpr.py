@@ -32,6 +32,8 @@ class PlaceModel(nn.Module):
             own (which is R = 1 for those that give one flat descriptor).
     """
 
+    correlates_alone = True  # `correlate` knows `alone`
+
     def __init__(self, config: ModelConfig, image_size: int) -> None:
         super().__init__()
         self.config = config
@@ -76,9 +78,12 @@ class PlaceModel(nn.Module):
         regions: Tensor = self.pooling(self.backbone(images))
         return regions
 
-    def correlate(self, regions: Tensor) -> Tensor:
-        """Descriptors of the images of a group: [b, R, D] -> [b, R*D], of unit length, float32 at least."""
-        related = self.cross_image(regions)
+    def correlate(self, regions: Tensor, alone: bool = False) -> Tensor:
+        """Descriptors of the images of a group: [b, R, D] -> [b, R*D], of unit length, float32 at least.
+
+        `alone`: b groups of one image each in one call, equal to b calls but for rounding.
+        """
+        related = self.cross_image(regions, alone)
         with torch.autocast(regions.device.type, enabled=False):
             return F.normalize(at_least_float32(related).flatten(1), dim=-1)
 

@@ -13,6 +13,7 @@ from typing import Any
 from torch import nn
 
 from pipeline.config import RunConfig
+from shards.errors import UsageError
 
 
 class Validation:
@@ -24,6 +25,7 @@ class Validation:
 
     Raises:
         DataError: a set is missing or not laid out as documented.
+        UsageError: a set cannot be scored.
     """
 
     def __init__(self, config: RunConfig, device: Any) -> None:
@@ -33,6 +35,12 @@ class Validation:
         recalls = tuple(sorted({*config.validate.recalls, 5}))
         self.config = dataclasses.replace(config.validate, recalls=recalls)
         self.sets = [load_set(name, self.config) for name in config.validate.sets]
+        for name, evaluated in zip(config.validate.sets, self.sets, strict=True):
+            if not evaluated.has_ground_truth:
+                raise UsageError(
+                    f"validate.sets: {name} has no ground truth, so no recall could choose a checkpoint; take another "
+                    "set, and let jobs.evaluate export this one's predictions"
+                )
         self.device = device
 
     def run(self, model: nn.Module, show: bool) -> tuple[dict[str, float], float]:

@@ -1,0 +1,194 @@
+"""Is a difference between two recalls real? Paired bootstrap over the queries both were measured on.
+
+Invariant: only predictions of the same queries with the same positives under the same protocol are compared, query by
+query; what both found or both missed says nothing about which is better.
+
+A resample of Q queries with replacement holds (gained, lost, neither) queries as one draw of a multinomial with the
+observed shares, so resampling costs nothing, whatever Q is; the interval is the percentile interval (Efron and
+Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13). With few disagreeing queries that interval is too
+narrow, so a difference is called real only if McNemar's exact test agrees (McNemar, 1947: a sign test of the
+disagreeing queries). Both take queries as independent; neighbouring frames of a drive are not, and deserve more doubt.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.evaluation.predictions import Predictions, load_predictions
+
+SAMPLES = 10_000
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Recall@k of a second run minus that of a first one, in percentage points."""
+
+    set_name: str
+    protocol: str
+    k: int
+    runs: tuple[str, str]
+    recalls: tuple[float, float]
+    queries: int
+    gained: int
+    """Queries that only the second found."""
+    lost: int
+    """Queries that only the first found."""
+    low: float
+    high: float
+    """The 95 % interval of the difference."""
+    p_value: float
+    """McNemar's exact test, two-sided."""
+
+    @property
+    def value(self) -> float:
+        """Points; positive: the second run is better."""
+        return 100.0 * (self.gained - self.lost) / self.queries
+
+    @property
+    def real(self) -> bool:
+        """Whether the interval leaves zero out and the exact test agrees."""
+        return (self.low > 0 or self.high < 0) and self.p_value < 1 - LEVEL
+
+    @property
+    def text(self) -> str:
+        """`R@1 82.1 -> 84.2: difference +2.1 [+0.4, +3.9] real`"""
+        told = "real" if self.real else "not distinguishable"
+        change = f"{self.value:+.1f} [{self.low:+.1f}, {self.high:+.1f}]"
+        return f"R@{self.k} {self.recalls[0]:.1f} -> {self.recalls[1]:.1f}: difference {change} {told}"
+
+
+def paired_interval(gained: int, lost: int, queries: int, seed: int = 0, samples: int = SAMPLES) -> tuple[float, float]:
+    """The 95 % percentile interval, in points, of `100 * (gained - lost) / queries` under resampling of the queries."""
+    shares = np.array([gained, lost, queries - gained - lost]) / queries
+    drawn = np.random.Generator(np.random.PCG64(seed)).multinomial(queries, shares, samples)
+    low, high = np.quantile(drawn[:, 0] - drawn[:, 1], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return 100.0 * float(low) / queries, 100.0 * float(high) / queries
+
+
+def mcnemar(gained: int, lost: int) -> float:
+    """Two-sided exact p-value that gains and losses are equally likely; 1 where nothing differs."""
+    n, few = gained + lost, min(gained, lost)
+    if n == 0:
+        return 1.0
+    # sums of binomials in logarithms: thousands of disagreeing queries overflow no float
+    logs = [math.lgamma(n + 1) - math.lgamma(i + 1) - math.lgamma(n - i + 1) - n * math.log(2) for i in range(few + 1)]
+    return min(1.0, 2.0 * math.fsum(map(math.exp, logs)))
+
+
+def differences(first: Predictions, second: Predictions, runs: tuple[str, str], ks: Sequence[int]) -> list[Difference]:
+    """The two compared at every k they both have; none where they were not measured on the same queries."""
+    if not _comparable(first, second):
+        return []
+    counted = np.ones(len(first.queries), bool)
+    if first.protocol.without_positives == "drop":
+        counted = np.fromiter((len(p) > 0 for p in first.positives), bool, len(counted))
+    queries = int(counted.sum())
+    found = []
+    for k in ks:
+        if queries == 0 or k > min(first.rows.shape[1], second.rows.shape[1]):
+            continue
+        hits = [((p.ranks >= 0) & (p.ranks < k))[counted] for p in (first, second)]
+        gained, lost = int((hits[1] & ~hits[0]).sum()), int((hits[0] & ~hits[1]).sum())
+        recalls = (100.0 * float(hits[0].mean()), 100.0 * float(hits[1].mean()))
+        interval = paired_interval(gained, lost, queries)
+        about = (first.set_name, first.protocol.name, k, runs, recalls, queries, gained, lost)
+        found.append(Difference(*about, *interval, mcnemar(gained, lost)))
+    return found
+
+
+def compare_folders(
+    runs: Sequence[tuple[str, Path]], ks: Sequence[int] = (1, 5, 10)
+) -> tuple[list[Difference], list[str]]:
+    """Every later run against the first, on every set and protocol both have predictions of.
+
+    Args:
+        runs: (name, folder of predictions); folders that are not there are told, not compared.
+
+    Returns:
+        (differences, what could not be compared and why).
+    """
+    notes = [f"{name}: no predictions in {folder}; run jobs.evaluate on it" for name, folder in runs if not _in(folder)]
+    there = [(name, folder) for name, folder in runs if _in(folder)]
+    found: list[Difference] = []
+    for name, folder in there[1:]:
+        base, base_folder = there[0]
+        common = [file for file in _in(folder) if (base_folder / file).is_file()]
+        if not common:
+            notes.append(f"{name} and {base} have no set and protocol in common")
+        for file in common:
+            first, second = load_predictions(base_folder / file), load_predictions(folder / file)
+            compared = differences(first, second, (base, name), ks)
+            if not compared:
+                notes.append(f"{file}: {name} was measured on other queries, positives or settings than {base}")
+            found += compared
+    return found, notes
+
+
+def as_text(found: Sequence[Difference]) -> str:
+    """Lines by pair of runs, set and protocol."""
+    lines: list[str] = []
+    heads: dict[tuple[str, str], None] = {}
+    for d in found:
+        if d.runs not in heads:
+            heads[d.runs] = None
+            lines.append(
+                f"{'' if len(heads) == 1 else chr(10)}{d.runs[0]} -> {d.runs[1]}, same queries, 95 % intervals"
+            )
+        lines.append(f"  {d.set_name}  {d.protocol}  {d.text}  ({d.gained} gained, {d.lost} lost of {d.queries:,})")
+    return "\n".join(lines)
+
+
+def as_markdown(found: Sequence[Difference]) -> str:
+    """A table, the real differences in bold."""
+    lines = ["| runs | set | protocol | N | recall, % | difference, 95 % interval | |", "|---|---|---|---|---|---|---|"]
+    for d in found:
+        told = "**real**" if d.real else "not distinguishable"
+        lines.append(
+            f"| {d.runs[0]} -> {d.runs[1]} | {d.set_name} | {d.protocol} | {d.k} | {d.recalls[0]:.1f} -> "
+            f"{d.recalls[1]:.1f} | {d.value:+.1f} [{d.low:+.1f}, {d.high:+.1f}] | {told} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def write_csv(found: Sequence[Difference], path: Path) -> None:
+    """One line a difference."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        named = [
+            "first",
+            "second",
+            "set",
+            "protocol",
+            "n",
+            "recall_first",
+            "recall_second",
+            "difference",
+            "low",
+            "high",
+        ]
+        writer.writerow([*named, "gained", "lost", "queries", "p_value", "real"])
+        for d in found:
+            interval = [*d.recalls, d.value, d.low, d.high]
+            counts = [d.gained, d.lost, d.queries]
+            writer.writerow([*d.runs, d.set_name, d.protocol, d.k, *interval, *counts, d.p_value, d.real])
+
+
+def _in(folder: Path) -> list[str]:
+    return sorted(file.name for file in folder.glob("*.parquet"))
+
+
+def _comparable(first: Predictions, second: Predictions) -> bool:
+    """The same queries in the same order, by name since folders move, with the same positives and protocol."""
+    return (
+        first.set_name == second.set_name
+        and first.protocol == second.protocol
+        and [Path(q).name for q in first.queries] == [Path(q).name for q in second.queries]
+        and all(np.array_equal(a, b) for a, b in zip(first.positives, second.positives, strict=True))
+    )

@@ -1,0 +1,91 @@
+"""`single` in one call for many images: equal to a call an image, on any number of processes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from processes import run_ranks
+from tiny import photo
+
+from pipeline.config import (
+    AdapterConfig,
+    BackboneConfig,
+    CrossImageConfig,
+    EvaluationConfig,
+    ModelConfig,
+    PoolingConfig,
+)
+from pipeline.data.images import load_image, normalise, to_input
+from pipeline.evaluation import descriptors
+from pipeline.evaluation.descriptors import calls_of
+from pipeline.evaluation.engine import Engine
+from pipeline.evaluation.evaluate import evaluating
+from pipeline.evaluation.evaluation_set import EvaluationSet
+from pipeline.evaluation.protocol import protocols
+from pipeline.model.vpr import PlaceModel, build_model
+
+
+def model() -> PlaceModel:
+    torch.manual_seed(3)
+    config = ModelConfig(
+        backbone=BackboneConfig(name="custom", dim=16, depth=1, heads=2, patch=7, pretrain_grid=4),
+        adapter=AdapterConfig(reduced=2),
+        pooling=PoolingConfig(levels=(1, 2)),
+        cross_image=CrossImageConfig(layers=2, heads=2, feedforward=16),
+    )
+    built = build_model(config, 28)
+    for parameter in built.cross_image.parameters():  # every one of them matters
+        torch.nn.init.normal_(parameter, std=0.3)
+    return built
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> EvaluationSet:
+    paths = [tmp_path / f"{i:02d}.jpg" for i in range(23)]
+    for i, path in enumerate(paths):
+        photo(i, 0).save(path)
+    return EvaluationSet("street", paths, paths[:1], [np.zeros(1, np.int64)], "pairs")
+
+
+def described(photos: EvaluationSet) -> np.ndarray:
+    descriptors.ALONE = 4  # several calls, the last one short
+    built, config = model(), EvaluationConfig(groups=("single",), workers=0, batch=5)
+    protocol = protocols(config, 28, "pairs")[0]
+    with evaluating(built):
+        engine = Engine(built, config, torch.device("cpu"), None, photos.database[0].parent, False, "")
+        blocks = engine.side(photos, "database", [protocol]).describe(protocol)
+    if blocks is None:  # not rank 0
+        return np.zeros(0)
+    whole = np.zeros((23, built.descriptor_dim), np.float32)
+    for rows, block in blocks():
+        whole[rows] = block
+    return whole
+
+
+def test_equal_to_each_image_by_itself_on_any_number_of_processes(
+    photos: EvaluationSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(descriptors, "ALONE", 4)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    together, built = described(photos), model().eval()
+    torch.set_num_threads(threads)
+    with torch.no_grad():
+        images = normalise(torch.stack([to_input(load_image(p), 28) for p in photos.database]))
+        by_itself = torch.cat([built(image[None]) for image in images]).numpy()
+        grouped = built(images).numpy()
+    np.testing.assert_allclose(together, by_itself, atol=1e-6)
+    assert np.abs(grouped - by_itself).max() > 1e-3  # a group would have told otherwise
+    for world in (1, 2, 3):
+        assert (run_ranks(described, world, photos)[0] == together).all()
+
+
+def test_only_groups_of_one_are_called_together() -> None:
+    singles = [np.array([i]) for i in range(130)]
+    calls, alone = calls_of(singles, model())
+    assert alone and [len(c) for c in calls] == [64, 64, 2] and np.concatenate(calls).tolist() == list(range(130))
+    pairs = [np.array([0, 1]), np.array([2])]
+    assert calls_of(pairs, model()) == (pairs, False) and calls_of(singles, object()) == (singles, False)
