@@ -148,7 +148,7 @@ class ResNet(nn.Module):
         return []
 
     def map(self, images: Tensor, recompute: bool = False) -> Tensor:
-        """[b, 3, H, W] normalised images -> [b, D, h, w]; `recompute`: for backward keep the bottlenecks' inputs alone."""
+        """[b, 3, H, W] normalised images -> [b, D, h, w]; `recompute`: keep bottlenecks' inputs alone."""
         x = images
         if self.layout == "keras":
             x = (x * self.deviation.to(x.dtype) + self.mean.to(x.dtype)).flip(1) * 255 - self.keras_means.to(x.dtype)

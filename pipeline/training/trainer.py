@@ -29,6 +29,7 @@ from pipeline.training import checkpoint
 from pipeline.training.checkpoint import RunState
 from pipeline.training.compiled import compile_backbone, uncompiled
 from pipeline.training.engine import Engine, build_engine, choose
+from pipeline.training.initialise import initialise
 from pipeline.training.launch import stop_signals
 from pipeline.training.loss import MultiSimilarityLoss
 from pipeline.training.meter import Meter
@@ -80,6 +81,8 @@ class Trainer:
         model = build_model(config.model, config.data.image_size)
         self.backbone_hash = frozen_hash(model)
         self.state, optimizer = self._resume(model)
+        if self.state.step == 0 and not optimizer:
+            initialise(model, self.index, config, accelerator.device)
         compile_backbone(model, config, choose(config.train.engine), accelerator.device)
         self.engine: Engine = build_engine(
             config.train,

@@ -1,0 +1,72 @@
+"""What a model learns from images before its first step: NetVLAD's cluster centres.
+
+Invariant: done once, before the first step of a new run, on rank 0 alone, from images that (shards, seed) determine, and
+then made the same on all ranks; a resumed run reads the result from its checkpoint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+import torch
+from torch import Tensor
+
+from pipeline.config import RunConfig
+from pipeline.data.images import normalise
+from pipeline.data.places import build_loader
+from pipeline.distributed import broadcast_object, rank
+from pipeline.model.aggregators.netvlad import NetVLAD
+from pipeline.model.vpr import PlaceModel
+from shards.errors import UserError
+from shards.index import ShardIndex
+
+
+def initialise(model: PlaceModel, index: ShardIndex, config: RunConfig, device: torch.device | str) -> None:
+    """Sets what has to be set from images; nothing for models that need none. Collective.
+
+    Args:
+        model: on the CPU, the same on all ranks; returned to the CPU.
+        index: the shards to draw from.
+        config: its data (without augmentation) and seed.
+        device: where features are computed.
+
+    Raises:
+        DataError: shards that cannot be read; the same on all ranks.
+    """
+    if not isinstance(model.pooling, NetVLAD):
+        return
+    problem: UserError | None = None
+    if rank() == 0:
+        print("clustering patch features for NetVLAD's start", file=sys.stderr, flush=True)
+        try:
+            features = sample_features(model, index, config, device)
+            model.pooling.to(device).cluster(features, config.seed)
+        except UserError as error:
+            problem = error
+        model.cpu()
+    problem = broadcast_object(problem)
+    if problem is not None:
+        raise problem
+    with torch.no_grad():
+        for parameter in model.pooling.parameters():
+            parameter.copy_(torch.from_numpy(broadcast_object(parameter.detach().numpy())))
+
+
+@torch.no_grad()
+def sample_features(model: PlaceModel, index: ShardIndex, config: RunConfig, device: torch.device | str) -> Tensor:
+    """Patch features [n, D], at most `samples` in all and `per_image` an image, of epoch 0's first places."""
+    wanted = config.model.pooling.netvlad
+    data = dataclasses.replace(config.data, augment="off", places_per_batch=min(8, config.data.places_per_batch))
+    generator = torch.Generator().manual_seed(config.seed)
+    found: list[Tensor] = []
+    model.to(device).eval()
+    for batch in build_loader(index, data, config.seed, 0, 0, 0, 1):
+        patches = model.backbone(normalise(batch.images.to(device)))[:, 1:]
+        for image in patches:
+            chosen = torch.randperm(len(image), generator=generator)[: wanted.per_image]
+            found.append(image[chosen.to(image.device)])
+        if sum(len(part) for part in found) >= wanted.samples:
+            break
+    model.train()
+    return torch.cat(found)[: wanted.samples]
