@@ -178,7 +178,9 @@ def zero_settings(given: dict[str, Any], precision: str, clip: float | None, mic
     zero = {key: value for key, value in given.get("zero_optimization", {}).items() if value != "auto"}
     stage = zero.get("stage")
     if stage not in STAGES:
-        raise UsageError(f"DeepSpeed zero_stage {stage} is not one of 1, 2, 3; without ZeRO use jobs/accelerate/ddp.yaml")
+        raise UsageError(
+            f"DeepSpeed zero_stage {stage} is not one of 1, 2, 3; without ZeRO use jobs/accelerate/ddp.yaml"
+        )
     if precision == "fp16" or given.get("fp16", {}).get("enabled") is True:
         raise UsageError("engine zero: fp16 makes DeepSpeed cast the weights themselves; use bf16, or DDP for fp16")
     if precision != "bf16" and given.get("bf16", {}).get("enabled") is True:

@@ -16,13 +16,17 @@ from pathlib import Path
 class JobProcess:
     """`python -m MODULE ARGUMENTS`, its output in a file."""
 
-    def __init__(self, module: str, arguments: list[str], output: Path) -> None:
+    def __init__(
+        self, module: str, arguments: list[str], output: Path, environment: dict[str, str] | None = None
+    ) -> None:
         import accelerate  # noqa: F401  what every job would import, once, in the parent
         import transformers.models.dinov2.modeling_dinov2  # noqa: F401
 
         importlib.import_module(module)
         self.output = output
-        self._process = multiprocessing.get_context("fork").Process(target=_run, args=(module, arguments, output))
+        self._process = multiprocessing.get_context("fork").Process(
+            target=_run, args=(module, arguments, output, environment or {})
+        )
         self._process.start()
 
     def alive(self) -> bool:
@@ -56,9 +60,10 @@ class JobProcess:
         self.send(number)
 
 
-def _run(module: str, arguments: list[str], output: Path) -> None:
+def _run(module: str, arguments: list[str], output: Path, environment: dict[str, str]) -> None:
     import torch
 
+    os.environ.update(environment)
     os.setpgrp()
     descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(descriptor, 1)
