@@ -108,6 +108,9 @@ class EvaluationConfig:
     """Scale PCA's directions to unit variance (published: no)."""
     search: Literal["exact", "ivfpq", "hnsw"] = "exact"
     """Exact L2 search, or a faiss approximation for large sets, whose recall against exact is measured and printed."""
+    rerank: int = 0
+    """Second stage: this many first candidates are put in order by matching patch tokens in space; 0: none. Reads the
+    candidates' images again; for evaluation of whole models, not under ZeRO-3."""
 
 
 @dataclass(frozen=True)

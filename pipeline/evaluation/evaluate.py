@@ -25,6 +25,7 @@ from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.projection import Projection, fit_rows, load_projection, projected, sample_rows
 from pipeline.evaluation.protocol import Protocol, Side, protocols
 from pipeline.evaluation.recall import recall_at
+from pipeline.evaluation.rerank import rerank
 from pipeline.evaluation.retrieval import (
     Blocks,
     agreement,
@@ -96,6 +97,9 @@ def evaluate(
                 described = {side: sides[side].describe(protocol) for side in SIDES}
                 fitted = (projections or {}).get(protocol.grouping.name)
                 answer = on_rank_0(partial(answer_queries, evaluated, protocol, config, described, fitted))
+                if protocol.rerank:
+                    again = partial(rerank, engine.model, evaluated, config, device, *answer[:2], progress)
+                    answer = (*on_rank_0(again), answer[2])
                 results.append(score(evaluated, protocol, config, *answer))
             for side in SIDES:
                 sides[side].close()
@@ -187,7 +191,7 @@ def answer_queries(
         fitted = fitted or fit_rows(database, rows, protocol.pca, protocol.whiten, about)
         database, queries = projected(database, fitted), projected(queries, fitted)
     asked = _in_order(queries, len(evaluated.queries))
-    k = max(config.recalls)
+    k = max(*config.recalls, protocol.rerank)
     if evaluated.database_part is not None and evaluated.query_part is not None:
         distances, rows = search_within(asked, evaluated.query_part, database, evaluated.database_part, k)
         return rows, distances, ("each query is searched within its own part of the database",)

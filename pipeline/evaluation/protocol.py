@@ -48,6 +48,8 @@ class Protocol:
     """Type in which descriptors were kept before the search: fp32 or fp16."""
     search: str = "exact"
     """exact L2, or the approximate index used."""
+    rerank: int = 0
+    """Candidates put in order anew by matching patches in space (a second stage); 0: none, one stage."""
 
     @property
     def name(self) -> str:
@@ -62,6 +64,8 @@ class Protocol:
         if self.without_positives == "drop":
             parts.append("drop")
         parts += [value for value in (self.precision, self.search) if value not in ("fp32", "exact")]
+        if self.rerank:
+            parts.append(f"rerank{self.rerank}")
         if self.stored != "fp32":
             parts.append(f"{self.stored}store")
         return "_".join(parts)
@@ -70,7 +74,7 @@ class Protocol:
     def grouping(self) -> Protocol:
         """The same protocol without what happens after the descriptors: PCA, positives, search."""
         return dataclasses.replace(
-            self, pca=None, whiten=False, pca_source=None, rule="", without_positives="", search="exact"
+            self, pca=None, whiten=False, pca_source=None, rule="", without_positives="", search="exact", rerank=0
         )
 
     def describe(self) -> str:
@@ -87,9 +91,10 @@ class Protocol:
                 f"PCA {self.pca}{' whitened' if self.whiten else ''} fitted on {self.pca_source or 'its own database'}"
             )
         missing = "a miss" if self.without_positives == "miss" else "dropped"
+        second = f", first {self.rerank} re-ranked by matching patches in space" if self.rerank else ""
         kept = self.precision if self.stored == self.precision else f"{self.precision}, stored {self.stored}"
         return (
-            f"{groups}; {self.image_size} px {interpolation}; {pca}; {kept}; {self.search} L2 search; "
+            f"{groups}; {self.image_size} px {interpolation}; {pca}; {kept}; {self.search} L2 search{second}; "
             f"positives {self.rule}; queries without positives {missing}"
         )
 
@@ -128,6 +133,7 @@ def protocols(config: EvaluationConfig, image_size: int, rule: str) -> list[Prot
             precision=config.precision,
             stored="fp16" if config.store == "fp16" else "fp32",
             search=config.search,
+            rerank=config.rerank,
         )
         for groups in dict.fromkeys(config.groups)
     ]

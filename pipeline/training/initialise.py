@@ -1,7 +1,7 @@
 """What a model learns from images before its first step: NetVLAD's cluster centres.
 
-Invariant: done once, before the first step of a new run, on rank 0 alone, from images that (shards, seed) determine, and
-then made the same on all ranks; a resumed run reads the result from its checkpoint.
+Invariant: done once, before the first step of a new run, on rank 0 alone, from images that (shards, seed) determine,
+and then made the same on all ranks; a resumed run reads the result from its checkpoint.
 """
 
 from __future__ import annotations

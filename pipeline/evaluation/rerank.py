@@ -1,0 +1,140 @@
+"""The second stage of two-stage retrieval: the first candidates put in order by matching patches in space.
+
+Invariant: only the order of the first `rerank` candidates changes, never which they are; a candidate's score depends on
+the two images and their row numbers alone, and ties keep the order of the global search. Patch tokens come from the
+backbone of the model that made the descriptors, one image at a time, so no grouping enters.
+
+The check: patches of query and candidate that are each other's nearest (cosine) are matches; a similarity transform
+(scale, rotation, shift) between the two patch grids is proposed by pairs of matches; the score is the largest number of
+matches that agree with one transform. (Patch-NetVLAD and TransVPR fit homographies by RANSAC to the same kind of
+matches; a similarity needs two matches instead of four, and a grid of patches holds few.)
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pipeline.config import EvaluationConfig
+from pipeline.data.images import load_image, normalise, to_input
+from pipeline.evaluation.evaluation_set import EvaluationSet
+from shards.errors import UsageError
+from shards.progress import Progress
+
+PROPOSALS = 256  # pairs of matches tried; all pairs where there are fewer
+TOLERANCE = 1.5  # patches: half a patch each of two roundings to the grid, and one of distortion
+SCALES = (0.5, 2.0)  # enlargement between two photographs of a place
+TURN = np.pi / 6  # cameras are held upright
+CACHE_BYTES = 2**30  # patch tokens kept: neighbours of one query are often candidates of the next
+
+
+def mutual_matches(a: Tensor, b: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of unit vectors a [n, D] and b [m, D] that are each other's nearest: two int64 arrays of the same length."""
+    similarities = a @ b.T
+    forward, backward = similarities.argmax(1), similarities.argmax(0)
+    rows = torch.arange(len(a), device=a.device)
+    mutual = backward[forward] == rows
+    return rows[mutual].cpu().numpy(), forward[mutual].cpu().numpy()
+
+
+def inliers(left: np.ndarray, right: np.ndarray, seed: tuple[int, int] = (0, 0)) -> int:
+    """The largest number of matches that agree with one similarity transform.
+
+    Args:
+        left, right: complex [n], matched positions (column + i row, in patches): right = s * left + t.
+        seed: names the pair of images; decides which pairs of matches are tried where there are too many for all.
+    """
+    n = len(left)
+    if n < 2:
+        return n
+    first, second = np.triu_indices(n, 1)
+    if len(first) > PROPOSALS:
+        # the raw stream of Philox is fixed for ever, where numpy's own samplers may change between versions
+        bits = np.random.Philox(key=np.array(seed, np.uint64)).random_raw(len(first))
+        chosen = np.argpartition(bits, PROPOSALS)[:PROPOSALS]
+        first, second = first[chosen], second[chosen]
+    step = left[first] - left[second]  # never 0: no patch is matched twice
+    s = (right[first] - right[second]) / step
+    plausible = (np.abs(s) >= SCALES[0]) & (np.abs(s) <= SCALES[1]) & (np.abs(np.angle(s)) <= TURN)
+    s, first = s[plausible], first[plausible]
+    if not len(s):
+        return 1
+    t = right[first] - s * left[first]
+    errors = np.abs(s[:, None] * left + t[:, None] - right)  # [proposals, n]
+    return int((errors <= TOLERANCE).sum(1).max())
+
+
+class PatchTokens:
+    """Unit patch tokens of an evaluation set's images, the most recently used kept."""
+
+    def __init__(self, model: Any, config: EvaluationConfig, device: torch.device | str) -> None:
+        self.model, self.config, self.device = model, config, torch.device(device)
+        self._kept: OrderedDict[Path, Tensor] = OrderedDict()
+
+    def of(self, path: Path) -> Tensor:
+        """[G*G, D], float16 and of unit length but for its rounding.
+
+        Raises:
+            DataError: an image that cannot be read.
+        """
+        if path not in self._kept:
+            image = to_input(load_image(path), self.model.image_size, self.config.resize).to(self.device)
+            image = normalise(image) if image.dtype == torch.uint8 else image
+            with torch.no_grad():
+                tokens = self.model.backbone(image[None])[0, 1:]
+            self._kept[path] = F.normalize(tokens.float(), dim=-1).half()
+            size = self._kept[path].numel() * 2
+            while len(self._kept) * size > CACHE_BYTES and len(self._kept) > 1:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(path)
+        return self._kept[path]
+
+
+def score(query: Tensor, candidate: Tensor, seed: tuple[int, int]) -> int:
+    """Matches in agreement between two images' unit patch tokens [G*G, D]."""
+    grid = round(len(query) ** 0.5)
+    left, right = mutual_matches(query.float(), candidate.float())
+    return inliers(*(rows % grid + 1j * (rows // grid) for rows in (left, right)), seed)
+
+
+def rerank(
+    model: Any,
+    evaluated: EvaluationSet,
+    config: EvaluationConfig,
+    device: torch.device | str,
+    predictions: np.ndarray,
+    distances: np.ndarray,
+    progress: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The first `config.rerank` of each query's candidates in the order of their scores; on one process.
+
+    Args:
+        model: a `PlaceModel` in evaluation mode.
+        predictions, distances: [Q, k] database rows (-1: none) and squared distances of the global search.
+
+    Raises:
+        UsageError: fewer candidates than are to be re-ranked; DataError: an image that cannot be read.
+    """
+    if predictions.shape[1] < config.rerank:
+        raise UsageError(f"rerank {config.rerank} needs as many candidates, the search gave {predictions.shape[1]}")
+    if model.backbone.grid < 4:
+        raise UsageError(f"rerank: {model.backbone.grid} x {model.backbone.grid} patches are too few to check in space")
+    tokens = PatchTokens(model, config, device)
+    rows, ordered = predictions.copy(), distances.copy()
+    with Progress(f"re-ranking {evaluated.name}", len(rows), "queries", enabled=progress) as bar:
+        for q, candidates in enumerate(predictions[:, : config.rerank]):
+            query = tokens.of(evaluated.queries[q])
+            scores = [
+                score(query, tokens.of(evaluated.database[row]), (q, int(row))) if row >= 0 else -1
+                for row in candidates
+            ]
+            order = np.argsort(-np.array(scores), kind="stable")
+            rows[q, : config.rerank], ordered[q, : config.rerank] = candidates[order], distances[q, order]
+            bar.advance()
+    return rows, ordered
