@@ -19,6 +19,8 @@ ALLOWED = {
         "shards", "pipeline.config", "pipeline.distributed", "pipeline.data", "pipeline.model", "pipeline.evaluation",
     },
     "pipeline.training": {"shards", "pipeline"},
+    "pipeline.benchmark": {"shards", "pipeline"},
+    "pipeline.experiments": {"shards", "pipeline"},
     "pipeline": set(),
     "jobs": {"shards", "pipeline", "jobs"},
 }  # fmt: skip

@@ -1,0 +1,85 @@
+"""The benchmark runs, also where only torch and transformers are installed, and compares equal things."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from processes import run_ranks
+
+from pipeline.benchmark import reading, timing
+from pipeline.benchmark.ranks import BothForms
+from pipeline.benchmark.sizes import SIZES
+from pipeline.distributed import rank
+
+# not on the GPU machines that only compute; a name whose module is None cannot be imported
+ABSENT = ("webdataset", "mlflow", "faiss", "deepspeed", "simplejpeg", "pyarrow", "matplotlib", "sklearn", "accelerate")
+
+
+def test_the_job_runs_where_only_torch_and_transformers_are() -> None:
+    program = (
+        f"import sys, runpy\nfor name in {ABSENT}: sys.modules[name] = None\n"
+        "sys.argv = ['jobs.benchmark', '--size', 'tiny', '--parts', '[data, step]', '--device', 'cpu']\n"
+        "runpy.run_module('jobs.benchmark', run_name='__main__')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "data: left out, pyarrow is not installed here" in done.stderr
+    lines = done.stdout.splitlines()
+    assert "no GPU" in lines[0] and f"torch {torch.__version__}" in lines[0]
+    for wanted in ("bf16 autocast", "forward: ", "2 at a time, in step", "inference, 8 images"):
+        assert any(wanted in line for line in lines), done.stdout
+
+
+def test_both_forms_give_the_same_loss_and_gradient() -> None:
+    """On two ranks; the same check runs in every benchmark before the clock starts."""
+
+    def both() -> tuple[dict[str, list[float]], bool]:
+        forms = BothForms(SIZES["tiny"], 16, torch.device("cpu"))
+        seconds = forms.seconds(2)
+        if rank() == 0:  # the check must be able to fail
+            forms.regions.data *= 2
+        different = not torch.allclose(forms.gradient("own_rows")[1], forms.gradient("redundant")[1] * 2)
+        return seconds, different
+
+    for seconds, different in run_ranks(both, 2):
+        assert different and all(len(times) == 2 and min(times) > 0 for times in seconds.values())
+
+
+def test_reading_is_compared_on_real_shards(tmp_path: Path) -> None:
+    comparisons = reading.measure(1, 8, 28, workers=(0,))
+    names = [row.name for comparison in comparisons for row in comparison.rows]
+    assert "shards, by offset" in names and "0 workers" in names
+    assert all(row.per_second > 0 for comparison in comparisons for row in comparison.rows)
+    files, index = reading.prepare(tmp_path, 2)
+    from pipeline.config import DataConfig
+    from pipeline.data.cache import ShardCache
+    from pipeline.data.places import Places, members
+
+    dataset = Places(members(index, [0, 1]), ShardCache(index, tmp_path, 1), DataConfig(), 0, 0)  # type: ignore[arg-type]
+    found = sorted(image for position in range(2) for image in dataset.encoded(position))
+    assert found == sorted(path.read_bytes() for path in files)  # both ways read the same bytes
+
+
+def test_ratios_are_taken_within_a_round() -> None:
+    """A machine that slows down threefold in the second round changes the times and not the ratio."""
+    comparison = timing.from_seconds("t", {"a": [1.0, 3.0], "b": [0.5, 1.5]}, items=6)
+    assert comparison.rows[1].ratios == (2.0, 2.0) and comparison.ratio("b") == 2.0
+    assert comparison.rows[0].per_second == 3.0
+    calls: list[str] = []
+    ways = {name: (lambda name=name: calls.append(name)) for name in "abc"}
+    timing.compare("t", ways, 1, 2, torch.device("cpu"))  # type: ignore[arg-type]
+    assert "".join(calls) == "abc" + "abc" + "cba"
+    shown = timing.show([comparison])
+    assert "2.00 (2.00-2.00)" in shown and len({len(line) for line in shown.splitlines()}) == 1
+
+
+@pytest.mark.gpu
+def test_the_step_on_a_gpu() -> None:
+    from pipeline.benchmark import step
+
+    found = step.measure(SIZES["tiny"], torch.device("cuda"), 2, 8, full=False)
+    assert all(row.seconds > 0 for comparison in found for row in comparison.rows)
