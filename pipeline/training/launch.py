@@ -39,6 +39,7 @@ def start(timeout: float) -> Any:
     # Accelerate still says broadcast_buffers, which torch 2.13 renames; and the gradient of a 1x1 convolution has
     # strides that DDP remarks upon once, at no cost here
     warnings.filterwarnings("ignore", message=".*broadcast_buffers.*", category=FutureWarning)
+    warnings.filterwarnings("ignore", message="This DataLoader will create .* worker processes")
     warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides.*")
     # DeepSpeed calls collectives by names that torch 2.13 renames, once a step
     warnings.filterwarnings("ignore", message=".*torch.distributed.*is deprecated", category=FutureWarning)
