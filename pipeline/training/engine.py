@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.config import TrainConfig
-from pipeline.distributed import is_distributed, rank, world_size
+from pipeline.distributed import is_distributed, rank
 from pipeline.model.vpr import PlaceModel
 from shards.errors import UsageError
 

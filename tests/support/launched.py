@@ -1,4 +1,4 @@
-"""A job on W ranks without a launcher: forked processes with the variables that a launcher, or the slurm scripts, set."""
+"""A job on W ranks without a launcher: forked processes with the variables that launchers and slurm scripts set."""
 
 from __future__ import annotations
 

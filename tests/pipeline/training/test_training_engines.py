@@ -112,7 +112,7 @@ def same_run(folder: Path, reference: Path) -> None:
 
 
 def test_a_run_goes_from_engine_to_engine(root: Path, reference: Path) -> None:
-    """ZeRO-2 on two ranks, killed; FSDP2 on two, killed; finished by one process: one run, the weights of none of it."""
+    """ZeRO-2 on two ranks, killed; FSDP2 on two, killed; finished by one process: the same run."""
     path = settings(root, "relay")
     folder = root / "outputs" / "relay"
     run("zero2", 2, path).kill_when(lambda: logged(folder, 3))
