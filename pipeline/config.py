@@ -145,7 +145,7 @@ class TrainConfig:
     """Images encoded at a time on a rank, recomputed in backward; none: all at once. Always exact. Memory then does not
     grow with the batch for adapter.norm group or none; with batch it grows slower, as BatchNorm needs all images."""
     compile: bool = False
-    """torch.compile the backbone's blocks, in place; one process or DDP, without encode_chunk. Validation stays as is."""
+    """torch.compile the backbone's blocks; for one process and DDP, without encode_chunk. Not used in validation."""
     engine: Literal["auto", "ddp", "fsdp2"] = "auto"
     """auto: what accelerate was launched with (DDP, DeepSpeed); fsdp2 shards parameters with fully_shard."""
     save_every: int = 200
