@@ -1,0 +1,102 @@
+"""Fill a table of the paper, row by row: trains and evaluates what is missing, puts the paper's figures beside ours.
+
+    python -m jobs.experiment --table ablation_crica --config jobs/configs/paper.yaml --root data --seeds 0,1,2
+    python -m jobs.experiment --table kernels --config jobs/configs/paper.yaml --dry-run
+    python -m jobs.experiment --table spm --launch "accelerate launch --config_file jobs/accelerate/ddp.yaml"
+
+The configuration gives sizes and data, the table's rows change what the paper's table says. Killed, it continues.
+Writes `<output>/tables/<table>/table.{md,csv,png}`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from jobs.cli import parse, run_job
+from pipeline.config import EvaluationConfig, RunConfig
+from shards.errors import DataError, UsageError, UserError
+
+
+@dataclass(frozen=True)
+class ExperimentJob(RunConfig):
+    """Fill a table. Every setting of a training is an option too; `name` and `seed` are given by the table."""
+
+    table: str = ""
+    """ablation_crica, ablation_adaptation, dimensions, epochs, encoder_layers, train_batch, inference_batch, kernels,
+    spm, same_data, or parts (ours)."""
+    seeds: tuple[int, ...] = (0,)
+    """A training of every row with each seed, as `0,1,2`: mean and standard deviation are shown."""
+    sets: tuple[str, ...] = ()
+    """Evaluation sets, names or paths; none: those of the paper's table. Missing ones are named and left out."""
+    root: str = "data"
+    """Folder under which set names are looked up."""
+    evaluate: EvaluationConfig = field(default_factory=lambda: EvaluationConfig(recalls=(1, 5, 10), resize="published"))
+    """How rows are evaluated, where the row does not say; `sets` and `root` are the options above."""
+    launch: str = ""
+    """Launcher of trainings and evaluations, such as 'accelerate launch --config_file jobs/accelerate/ddp.yaml'; empty:
+    one plain process."""
+    pitts30k_shards: str = ""
+    """same_data: shards of Pitts30k's training images, for the row that is trained on them."""
+    resnet_weights: str | None = None
+    """same_data: ImageNet weights of ResNet-50 for NetVLAD, CosPlace, GeM and MixVPR; none: random weights."""
+    images_per_second: float | None = None
+    """Measured training speed, for the estimate of --dry-run; none: what recorded runs of the same rows reached."""
+    dry_run: bool = False
+    """Say which rows, trainings and sets there are, what they cost and what is missing; do nothing."""
+    measure: str = ""
+    """Internal: a file with the evaluations of one run, which this process carries out."""
+
+
+def main() -> None:
+    """Parses, fills, prints and writes the table."""
+    job = parse(ExperimentJob, __doc__ or "")
+    if job.measure:
+        measure(Path(job.measure), job.train.timeout)
+        return
+    if not job.table:
+        raise UsageError("--table is missing, for example --table ablation_crica")
+    from pipeline.experiments import report, study
+    from pipeline.experiments.rows import table
+    from pipeline.experiments.runner import Runner
+
+    base = RunConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(RunConfig)})
+    wanted = dataclasses.replace(job.evaluate, sets=job.sets, root=job.root)
+    runner = Runner(Path(job.output), job.launch)
+    shards = {"pitts30k_shards": job.pitts30k_shards}
+    filled = study.build(job.table, table(job.table), base, wanted, job.seeds, runner, shards, job.resnet_weights)
+    if job.dry_run:
+        print(report.costs(filled, job.images_per_second))
+        return
+    for line in filled.missing:
+        print(f"missing: {line}", file=sys.stderr)
+    if not filled.sets:
+        raise DataError(f"no evaluation set of the table is there: give --root or --sets ({'; '.join(filled.missing)})")
+    filled.fill()
+    folder = Path(job.output) / "tables" / job.table
+    report.write(filled, folder)
+    print(report.terminal(filled))
+    print(f"\nwritten to {folder}/: table.md, table.csv, table.png")
+
+
+def measure(order: Path, timeout: float) -> None:
+    """The evaluations of one trained run, on every process that was launched."""
+    from pipeline.experiments.measure import measure as carry_out
+    from pipeline.training.launch import finish, start
+
+    accelerator = start(timeout)
+    try:
+        carry_out(order, accelerator)
+    except UserError as error:
+        if accelerator.is_main_process:
+            raise
+        sys.exit(error.exit_code)  # rank 0 tells it
+    finally:
+        del accelerator
+        finish()
+
+
+if __name__ == "__main__":
+    run_job(main)
