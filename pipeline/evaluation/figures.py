@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: retrieval grids, recall curves, where the errors lie, what the backbone looks at.
+"""Pictures of an evaluation: retrieval grids, recall curves, what the backbone looks at.
 
 Invariant: every picture names its set, protocol and recall; green is a correct answer and red a wrong one, everywhere,
 with a sign beside the colour for those who do not see it. Files are drawn without a display (Agg).
@@ -47,7 +47,7 @@ Kind = Literal["correct", "failures", "worst"]
 
 
 @contextmanager
-def _canvas(width: float, height: float, path: Path, layout: Any = "constrained") -> Iterator[Any]:
+def canvas(width: float, height: float, path: Path, layout: Any = "constrained") -> Iterator[Any]:
     """A figure in the house style, inches, saved to `path` at the end (.png, or .jpg for photos)."""
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -61,7 +61,7 @@ def _canvas(width: float, height: float, path: Path, layout: Any = "constrained"
         figure.savefig(path, dpi=DPI, pil_kwargs={"quality": 88} if path.suffix == ".jpg" else {})
 
 
-def _heading(axes: Any, title: str, below: str) -> None:
+def heading(axes: Any, title: str, below: str) -> None:
     """A bold title, and what it is about in grey below it."""
     axes.set_title(title, pad=24)
     axes.text(0, 1.02, below, transform=axes.transAxes, fontsize=8.5, color=GREY, va="bottom", in_layout=False)
@@ -115,7 +115,7 @@ def retrieval_grid(
     wide, gap, label, head = 1.95, 0.14, 0.44, 0.86
     high = wide * tile[1] / tile[0]
     width, height = gap + columns * (wide + gap), head + len(chosen) * (high + label)
-    with _canvas(width, height, path, layout="none") as figure:
+    with canvas(width, height, path, layout="none") as figure:
         figure.text(gap / width, 1 - 0.14 / height, title, fontsize=14, fontweight="bold", va="top")
         figure.text(gap / width, 1 - 0.42 / height, caption(result), fontsize=9.5, color=GREY, va="top")
 
@@ -156,7 +156,7 @@ def answer_grid(rows: Sequence[tuple[Path, Sequence[tuple[Path, str]]]], path: P
     wide, gap, label, head = 1.95, 0.14, 0.44, 0.86
     high = wide * tile[1] / tile[0]
     width, height = max(5.0, gap + columns * (wide + gap)), head + len(rows) * (high + label)
-    with _canvas(width, height, path, layout="none") as figure:
+    with canvas(width, height, path, layout="none") as figure:
         figure.text(gap / width, 1 - 0.14 / height, title, fontsize=14, fontweight="bold", va="top")
         figure.text(gap / width, 1 - 0.42 / height, below, fontsize=9.5, color=GREY, va="top")
         for row, (photo, answers) in enumerate(rows):
@@ -175,7 +175,7 @@ def answer_grid(rows: Sequence[tuple[Path, Sequence[tuple[Path, str]]]], path: P
 
 def recall_curves(curves: Mapping[str, np.ndarray], path: Path, title: str, below: str = "") -> None:
     """Recall@N over N, one line for each name (a protocol, a run): percent [n] for N = 1 ... n (`curve_of`)."""
-    with _canvas(7.4, 4.6, path) as figure:
+    with canvas(7.4, 4.6, path) as figure:
         axes = figure.subplots()
         longest = max(len(curve) for curve in curves.values())
         lowest = min(float(curve.min()) for curve in curves.values())
@@ -185,7 +185,7 @@ def recall_curves(curves: Mapping[str, np.ndarray], path: Path, title: str, belo
             style |= {"ls": ("-", "--", "-.", ":")[number % 4], "marker": "osD^vP*X"[number % 8], "ms": 4}
             axes.plot(np.arange(1, len(curve) + 1), curve, label=f"{name}   R@1 {curve[0]:.1f}", **style)
         axes.set(xlabel="N, answers looked at", ylabel="Recall@N  (%)", xlim=(0.7, longest + 0.3))
-        _heading(axes, title, below)
+        heading(axes, title, below)
         axes.set_ylim(max(0, lowest - 6), 101)
         ticks = [n for n in (1, 5, 10, 15, 20, 25, 50, 100) if n <= longest]
         axes.set_xticks(ticks)
@@ -199,48 +199,6 @@ def curve_of(evaluated: EvaluationSet, result: Result) -> np.ndarray:
         ranks = ranks[np.fromiter((len(p) > 0 for p in evaluated.positives), bool, len(ranks))]
     within = (ranks[:, None] >= 0) & (ranks[:, None] < np.arange(1, result.predictions.shape[1] + 1))
     return 100.0 * within.mean(axis=0)
-
-
-def error_plot(evaluated: EvaluationSet, result: Result, path: Path) -> None:
-    """Where the first answers lie: on the ground where positions are known, else answer over query along the sets."""
-    right = np.fromiter((_correct(evaluated, result, q, 0) for q in range(result.queries)), bool, result.queries)
-    if evaluated.database_positions is None or evaluated.query_positions is None:
-        _order_plot(evaluated, result, right, path)
-        return
-    origin = evaluated.database_positions.min(axis=0)
-    database, queries = evaluated.database_positions - origin, evaluated.query_positions - origin
-    answers = database[result.predictions[:, 0]]
-    extent = np.ptp(np.concatenate([database, queries]), axis=0) + 1e-9
-    height = float(np.clip(7.5 * extent[1] / extent[0], 3.2, 8.0))
-    with _canvas(8.6, height + 1.2, path) as figure:
-        axes = figure.subplots()
-        axes.scatter(*database.T, s=5, color="#cfd4da", lw=0, label=f"database, {len(database):,} images")
-        for q in np.flatnonzero(~right):
-            axes.plot(*zip(queries[q], answers[q], strict=True), color=RED, lw=0.7, alpha=0.35, zorder=2)
-        axes.scatter(*queries[right].T, s=20, color=GREEN, marker="o", lw=0, label=f"{right.sum():,} found", zorder=3)
-        wrong = f"{(~right).sum():,} wrong; a line leads to the answer"
-        axes.scatter(*queries[~right].T, s=24, color=RED, marker="x", lw=1.4, label=wrong, zorder=4)
-        axes.set(xlabel="metres east", ylabel="metres north", aspect="equal")
-        _heading(axes, "Where the first answers lie", caption(result))
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, handletextpad=0.3)
-
-
-def _order_plot(evaluated: EvaluationSet, result: Result, right: np.ndarray, path: Path) -> None:
-    """For sequences and pairs: the row of the first answer over the row of the query; truth is a band."""
-    query = np.arange(result.queries)
-    with _canvas(7.2, 7.4, path) as figure:
-        axes = figure.subplots()
-        truth = [(q, p) for q, positives in enumerate(evaluated.positives) for p in positives]
-        if truth:
-            axes.scatter(*zip(*truth, strict=True), s=7, color="#cfd4da", lw=0, label="positives")
-        found = result.predictions[:, 0]
-        axes.scatter(query[right], found[right], s=16, color=GREEN, lw=0, label=f"{right.sum():,} right")
-        axes.scatter(
-            query[~right], found[~right], s=20, color=RED, marker="x", lw=1.2, label=f"{(~right).sum():,} wrong"
-        )
-        axes.set(xlabel="query, in file order", ylabel="first answer, database row")
-        _heading(axes, "The first answer to each query", caption(result))
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, handletextpad=0.3)
 
 
 def attention_maps(model: Any, photos: Sequence[Path]) -> np.ndarray:
@@ -260,7 +218,7 @@ def attention_maps(model: Any, photos: Sequence[Path]) -> np.ndarray:
 def attention_overlay(model: Any, photos: Sequence[Path], path: Path, title: str) -> None:
     """Photos above their `attention_maps`, each map scaled to its own range."""
     maps, size = attention_maps(model, photos), int(model.image_size)
-    with _canvas(2.0 * len(photos), 4.9, path) as figure:
+    with canvas(2.0 * len(photos), 4.9, path) as figure:
         figure.suptitle(title, x=0.008, ha="left", fontsize=13, fontweight="bold")
         axes = figure.subplots(2, len(photos), squeeze=False)
         for i, photo in enumerate(photos):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.evaluation import figures
+from pipeline.evaluation.error_plots import error_plot
 from pipeline.evaluation.evaluate import Result
 from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.tables import notes, rows
@@ -77,7 +78,7 @@ def draw(results: Sequence[Result], sets: Sequence[EvaluationSet], folder: Path)
         for number, result in enumerate(scored):
             protocol = result.protocol.name
             path = folder / f"{name}.{protocol}.errors.png"
-            figures.error_plot(evaluated, result, path)
+            error_plot(evaluated, result, path)
             drawn.append(Picture(name, f"{protocol}: where the first answers lie", path, number == 0))
             for kind, title in GRIDS:
                 chosen = figures.choose(evaluated, result, kind)
