@@ -1,0 +1,95 @@
+"""Runs in a real MLflow store, compared: numbers as recorded, only differing settings, the best marked."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from pipeline.config import RunConfig, TrackingConfig
+from pipeline.training import comparison
+from pipeline.training.tracking import Tracker, store_uri
+from shards.errors import UsageError
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three runs of two names; the newer `a` replaces the older."""
+    output = tmp_path_factory.mktemp("mlflow")
+    base = RunConfig(output=str(output), tracking=TrackingConfig(uri=None))
+    recalls = {"a-old": (10.0, 20.0), "a": (50.0, 80.5), "b": (60.0, 70.25)}
+    for label, (first, fifth) in recalls.items():
+        config = dataclasses.replace(base, name=label.removesuffix("-old"), seed=1 if label == "b" else 0)
+        tracker = Tracker(config)
+        for step, share in ((0, 0.5), (10, 1.0)):
+            tracker.metrics(
+                {
+                    "validation/city.shuffled16.recall_at_1": share * first,
+                    "validation/city.shuffled16.recall_at_5": share * fifth,
+                    "evaluation/city.single.recall_at_1": share * first,
+                    "evaluation/city.single.recall_at_5": share * fifth,
+                    "evaluation/city.single.recall_at_10": 99.0,
+                    "train/loss": 1.5 - share * first / 100,
+                },
+                step,
+            )
+        tracker.close("FINISHED")
+    return output
+
+
+def runs_of(store: Path, *wanted: str) -> list[comparison.Run]:
+    return comparison.load_runs(store_uri(None, str(store)), "place-recognition", wanted)
+
+
+def test_newest_run_of_each_name(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    runs = runs_of(store)
+    assert [run.name for run in runs] == ["a", "b"]
+    assert runs[0].metrics["evaluation/city.single.recall_at_5"] == 80.5
+    assert runs[1].history["validation/city.shuffled16.recall_at_1"] == [(0, 30.0), (10, 60.0)]
+    assert runs_of(store, runs[1].run_id, "a")[0].name == "b"
+
+
+def test_table_marks_the_best_and_shows_only_what_differs(store: Path, tmp_path: Path) -> None:
+    runs = runs_of(store, "a", "b")
+    table = comparison.cells(runs)
+    rows = {row[0]: row[1:] for row in table}
+    assert rows["evaluation/city.single.recall_at_1"] == ["50.0", "60.0 *"]
+    assert rows["evaluation/city.single.recall_at_5"] == ["80.5 *", "70.2"]
+    assert rows["evaluation/city.single.recall_at_10"] == ["99.0", "99.0"], "a tie has no winner"
+    assert rows["train/loss"] == ["1.0000", "0.9000 *"], "the lowest loss is the best"
+    assert rows["seed"] == ["0", "1"]
+    assert "data.places_per_batch" not in rows
+    assert "name" not in rows
+    names = [row[0] for row in table[1:]]
+    ordered = [n for n in names if n.startswith("evaluation/")]
+    assert [n.rsplit("_", 1)[1] for n in ordered] == ["1", "5", "10"], "N in numeric order"
+    assert "**60.0**" in comparison.as_markdown(table)
+    comparison.write_csv(table, tmp_path / "table.csv")
+    with (tmp_path / "table.csv").open() as file:
+        assert next(iter(csv.reader(file))) == ["", "a", "b"]
+    assert len({len(line) for line in comparison.as_text(table).splitlines()}) == 1, "columns are aligned"
+
+
+def test_curves_are_drawn(store: Path, tmp_path: Path) -> None:
+    from PIL import Image
+
+    assert comparison.draw_curves(runs_of(store), tmp_path / "curves.png")
+    with Image.open(tmp_path / "curves.png") as picture:
+        assert picture.width > 500
+        assert len(picture.convert("RGB").getcolors(1 << 20) or []) > 50
+
+
+def test_what_is_missing_is_named(store: Path) -> None:
+    with pytest.raises(UsageError, match=r"no run 'c'; it has: a, b"):
+        runs_of(store, "c")
+    with pytest.raises(UsageError, match=r"no experiment 'nothing'; it has: .*place-recognition"):
+        comparison.load_runs(store_uri(None, str(store)), "nothing")
+
+
+def test_a_store_that_cannot_be_reached_is_an_error_at_the_start(tmp_path: Path) -> None:
+    config = RunConfig(output=str(tmp_path), tracking=TrackingConfig(uri="http://127.0.0.1:9"))
+    with pytest.raises(UsageError, match=r"MLflow store http://127\.0\.0\.1:9 cannot be used"):
+        Tracker(config)
