@@ -13,6 +13,7 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from jobs.cli import parse, run_job
 from shards.errors import UsageError
@@ -30,8 +31,8 @@ class EnginesJob:
     """Names of files in jobs/accelerate."""
     processes: int = 2
     """Ranks of each launch."""
-    train: str = "full"
-    """What of the backbone is trained: full, adapters, last."""
+    train: Literal["adapters", "full", "frozen", "last"] = "full"
+    """What of the backbone is trained."""
     encode_chunk: int | None = None
     """Images encoded at a time, as train.encode_chunk; none: all at once."""
     write: str | None = None

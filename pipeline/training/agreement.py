@@ -8,7 +8,7 @@ whatever the launch, the answers may differ by rounding alone.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ MODEL = ModelConfig(
     cross_image=CrossImageConfig(layers=2, heads=4, feedforward=48, dropout=0.0),
     train="full",
 )
+Train = Literal["adapters", "full", "frozen", "last"]
 PLACES, VIEWS, SIZE, STEPS, RATE = 8, 4, 56, 3, 0.1
 
 
@@ -53,7 +54,7 @@ def batches(dtype: torch.dtype) -> list[Tensor]:
     return [(0.3 * places + n).reshape(PLACES * VIEWS, 3, SIZE, SIZE).to(dtype) for n in noise]
 
 
-def measure(accelerator: Any, config: TrainConfig, dtype: torch.dtype, train: str = "full") -> dict[str, Tensor]:
+def measure(accelerator: Any, config: TrainConfig, dtype: torch.dtype, train: Train = "full") -> dict[str, Tensor]:
     """Three SGD steps under this launch's engine (collective).
 
     Args:

@@ -12,8 +12,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pipeline.model.backbone import Backbone
 from pipeline.model.batch_norm import GlobalBatchNorm2d
 from pipeline.model.vpr import PlaceModel, parameter_counts
+from shards.errors import UsageError
 
 ROUNDS = {"all_gather": 1, "reduce_scatter": 1, "all_reduce": 2}
 
@@ -45,7 +47,13 @@ class StepSizes:
 
 
 def step_sizes(model: PlaceModel, images: int, key_bytes: int = 4) -> StepSizes:
-    """Sizes of a step of this model with b = `images` on a rank; the model may be on the meta device."""
+    """Sizes of a step of this model with b = `images` on a rank; the model may be on the meta device.
+
+    Raises:
+        UsageError: a backbone whose operations are not those of a vision transformer.
+    """
+    if not isinstance(model.backbone, Backbone):
+        raise UsageError(f"the cost model knows vision transformers, not {model.config.backbone.name}")
     counts = parameter_counts(model)
     encoder = model.config.cross_image
     return StepSizes(
