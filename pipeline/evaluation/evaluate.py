@@ -98,7 +98,7 @@ def evaluate(
                 fitted = (projections or {}).get(protocol.grouping.name)
                 answer = on_rank_0(partial(answer_queries, evaluated, protocol, config, described, fitted))
                 if protocol.rerank:
-                    again = partial(rerank, engine.model, evaluated, config, device, *answer[:2], progress)
+                    again = partial(rerank, engine.model, evaluated, config, device, answer[0], answer[1], progress)
                     answer = (*on_rank_0(again), answer[2])
                 results.append(score(evaluated, protocol, config, *answer))
             for side in SIDES:

@@ -100,7 +100,7 @@ def score(query: Tensor, candidate: Tensor, seed: tuple[int, int]) -> int:
     """Matches in agreement between two images' unit patch tokens [G*G, D]."""
     grid = round(len(query) ** 0.5)
     left, right = mutual_matches(query.float(), candidate.float())
-    return inliers(*(rows % grid + 1j * (rows // grid) for rows in (left, right)), seed)
+    return inliers(left % grid + 1j * (left // grid), right % grid + 1j * (right // grid), seed)
 
 
 def rerank(
