@@ -1,0 +1,187 @@
+"""The paper's figures, from one's own models.
+
+    python -m jobs.figures --kind parameters --to figures/parameters.md
+    python -m jobs.figures --kind attention --checkpoint outputs/RUN --photos a.jpg,b.jpg --to figures/attention.jpg
+    python -m jobs.figures --kind tsne --checkpoint outputs/RUN --places-from data/gsv --to figures/places.png
+    python -m jobs.figures --kind qualitative --checkpoint outputs/RUN --baseline outputs/OTHER --sets pitts30k \
+        --to figures/retrieval.jpg
+
+attention: channel means of the patch tokens, backbone as released and adapted. tsne: 36 places of 12 photos, the
+features before adaptation, after it, and of the complete model. qualitative: first answers where two models differ.
+parameters: Total, Backbone, Adapter, Others and Tunable of every variant.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from jobs.cli import parse, run_job
+from pipeline.config import EvaluationConfig, ModelConfig
+from shards.errors import DataError, UsageError
+
+
+@dataclass(frozen=True)
+class FiguresJob(EvaluationConfig):
+    """Draw a figure of the paper. The settings of an evaluation apply; of `groups` the first counts."""
+
+    kind: Literal["attention", "tsne", "qualitative", "parameters"] = "parameters"
+    """Which figure."""
+    to: str = ""
+    """File to write: .png or .jpg; .md for the parameters."""
+    groups: tuple[Literal["single", "shuffled", "ordered"], ...] = ("shuffled",)
+    """How images share the cross-image encoder; the first counts."""
+    checkpoint: str = ""
+    """Our model: a run or checkpoint folder, a file, or a released CricaVPR .pth."""
+    baseline: tuple[str, ...] = ()
+    """What it is compared with: models as for --checkpoint; attention and tsne also take a backbone's weights, and
+    take the checkpoint's own backbone without its adapters where none is given."""
+    photos: tuple[str, ...] = ()
+    """attention: photos, or folders of which six are taken evenly."""
+    places_from: str = ""
+    """tsne: a folder in a layout that jobs.prepare reads: GSV-Cities', or a folder a place."""
+    places: int = 36
+    """tsne: number of places (paper: 36)."""
+    images: int = 12
+    """tsne: photos of each place (paper: 12)."""
+    perplexity: float = 30.0
+    """tsne: about how many neighbours count; at most a third of the photos."""
+    seed: int = 0
+    """tsne: draws the places and photos."""
+    count: int = 6
+    """qualitative: rows."""
+    variants: tuple[str, ...] = ()
+    """parameters: the paper's names; none: all."""
+
+
+def main() -> None:
+    """Parses and draws."""
+    job = parse(FiguresJob, __doc__ or "")
+    endings = (".md",) if job.kind == "parameters" else (".png", ".jpg")
+    if (job.to and Path(job.to).suffix not in endings) or (not job.to and job.kind != "parameters"):
+        raise UsageError(f"--to '{job.to}': a file ending in {' or '.join(endings)} is wanted")
+    if job.kind == "parameters":
+        parameters(job)
+        return
+    if not job.checkpoint:
+        raise UsageError("--checkpoint is missing: a run folder such as outputs/cricavpr, or a model file")
+    import torch
+
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    model = _model(job.checkpoint, None, device)
+    {"attention": attention, "tsne": places, "qualitative": qualitative}[job.kind](job, model, device)
+    print(f"written to {job.to}")
+
+
+def parameters(job: FiguresJob) -> None:
+    """Prints the table; writes markdown where asked."""
+    from pipeline.model import parameter_table
+    from pipeline.model.variants import VARIANTS
+
+    rows = parameter_table.table(job.variants or VARIANTS)
+    print(parameter_table.as_text(rows))
+    if job.to:
+        Path(job.to).parent.mkdir(parents=True, exist_ok=True)
+        Path(job.to).write_text(parameter_table.as_markdown(rows))
+        print(f"\nwritten to {job.to}")
+
+
+def attention(job: FiguresJob, model: Any, device: Any) -> None:
+    """Frozen and adapted backbone side by side."""
+    from pipeline.evaluation.figures import attention_maps
+    from pipeline.evaluation.paper_figures import attention_comparison
+    from pipeline.evaluation.place_features import pretrained
+
+    photos = _photos(job.photos)
+    maps = []
+    for name in job.baseline:
+        maps.append((_short(name), attention_maps(_model(name, model, device), photos)))
+    if not maps:
+        with pretrained(model):
+            maps.append(("pre-trained", attention_maps(model, photos)))
+    maps.append(("adapted", attention_maps(model, photos)))
+    below = f"Channel mean of the patch tokens, {model.image_size} px, each map over its own range · {job.checkpoint}"
+    attention_comparison(photos, maps, int(model.image_size), Path(job.to), below)
+
+
+def places(job: FiguresJob, model: Any, device: Any) -> None:
+    """t-SNE of places before adaptation, after it, and of the complete model."""
+    from pipeline.evaluation.paper_figures import place_maps
+    from pipeline.evaluation.place_features import choose_places, stages
+
+    if not job.places_from:
+        raise UsageError("--places-from is missing: a folder in GSV-Cities' layout, or one with a folder a place")
+    chosen = choose_places(Path(job.places_from), job.places, job.images, job.seed)
+    baselines = [(_short(name), _model(name, model, device)) for name in job.baseline]
+    config = _config(job)
+    found = stages(model, baselines, chosen.paths, config, device)
+    groups = config.groups[0] + ("" if config.groups[0] == "single" else str(config.group_size))
+    below = f"{job.places_from} · {job.checkpoint} · groups {groups} · perplexity {job.perplexity:g}"
+    shares = place_maps(found, chosen.labels, Path(job.to), below, job.perplexity)
+    for stage, share in zip(found, shares, strict=True):
+        print(f"{stage.title:<32} nearest photo of the same place {share:5.1f} %")
+
+
+def qualitative(job: FiguresJob, model: Any, device: Any) -> None:
+    """First answers where the model and a baseline differ."""
+    from pipeline.evaluation.datasets import load_set
+    from pipeline.evaluation.evaluate import evaluate
+    from pipeline.evaluation.paper_figures import retrieval_comparison
+
+    if not job.baseline or len(job.sets) != 1:
+        raise UsageError("--kind qualitative wants --baseline (one model or more) and one set in --sets")
+    config = _config(job)
+    evaluated = load_set(job.sets[0], config)
+    results = [("ours", evaluate(model, [evaluated], config, device)[0])]
+    for name in job.baseline:
+        results.append((_short(name), evaluate(_model(name, None, device), [evaluated], config, device)[0]))
+    found = retrieval_comparison(evaluated, results, Path(job.to), job.count)
+    print(f"ours alone right: {len(found.ours)}; {results[1][0]} alone right: {len(found.baseline)}")
+
+
+def _config(job: FiguresJob) -> EvaluationConfig:
+    values = {f.name: getattr(job, f.name) for f in dataclasses.fields(EvaluationConfig)}
+    return EvaluationConfig(**values | {"groups": job.groups[:1]})
+
+
+def _model(source: str, like: Any | None, device: Any) -> Any:
+    """A model; or, where one is given to compare with, released weights in a backbone like its own."""
+    from pipeline.model import exchange
+
+    kind = exchange.kind_of(source)
+    if kind != "backbone":
+        return exchange.read_model(source, kind, ModelConfig(), None).to(device)
+    if like is None:
+        raise UsageError(f"{source}: a backbone alone; make it a model first: jobs.weights --variant FrozenDINOv2-SPM")
+    from pipeline.model.variants import variant
+
+    config = variant("FrozenDINOv2-SPM", like.config)
+    return exchange.around_backbone(source, config, int(like.image_size)).to(device)
+
+
+def _photos(given: tuple[str, ...], each: int = 6) -> list[Path]:
+    if not given:
+        raise UsageError("--photos is missing: photos, or a folder of them")
+    found: list[Path] = []
+    for name in map(Path, given):
+        if name.is_dir():
+            inside = sorted(p for p in name.rglob("*") if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
+            if not inside:
+                raise DataError(f"{name}: no photos in it")
+            step = max(1, len(inside) // each)
+            found += inside[step // 2 :: step][:each]
+        else:
+            found.append(name)
+    return found
+
+
+def _short(source: str) -> str:
+    """What a baseline is called in a figure: its file's or run folder's name."""
+    path = Path(source)
+    return path.stem if path.suffix else path.name
+
+
+if __name__ == "__main__":
+    run_job(main)
