@@ -160,6 +160,9 @@ class Backbone(nn.Module):
             self.vit: Any = (_dinov3 if size.rope else _dinov2)(size, config.backbone)
             if not size.rope:
                 self.vit.embeddings = Embeddings(self.vit.embeddings, self.grid, size.registers)
+        if size.rope:  # its frequencies follow from the config and are in no file: real also where all else is shapes
+            with torch.device("cpu"):
+                self.vit.rope_embeddings = type(self.vit.rope_embeddings)(self.vit.config)
         if weights:
             from pipeline.model.pretrained import load_backbone
 
