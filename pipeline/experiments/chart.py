@@ -80,8 +80,9 @@ def _lines(panel: Any, study: Study, set_name: str) -> None:
     for number, ending in enumerate(study.table.series or ("",)):
         rows = {row: r.axis for row, r in study.table.rows.items() if _in_series(study, row, ending)}
         named = ending if not study.table.series else (f", {ending.strip('+')}" if ending else ", without")
-        style = {"marker": "os"[number % 2], "ms": 5, "lw": 2.0, "capsize": 3}
-        for g in _groupings(protocols):
+        for order, g in enumerate(_groupings(protocols)):
+            # lines that coincide stay visible: later ones are thinner
+            style = {"marker": "os"[number % 2], "ms": 8 - 2 * order, "lw": 3.2 - 0.9 * order, "capsize": 3}
             points = []
             for row, at in rows.items():
                 protocol = protocols.get(row, {}).get(g)
