@@ -84,6 +84,7 @@ def built(root: Path, name: str, seeds: tuple[int, ...] = (0,), **evaluate: Any)
     return study.build(name, table(name), base, wanted, seeds, Runner(root / "outputs"))
 
 
+@pytest.mark.timeout(900)  # starts interpreters: half a minute, minutes on a busy machine
 def test_a_table_is_filled_continued_and_found_in_mlflow(root: Path) -> None:
     """Five rows of one training; the figures are those of the library asked directly; nothing is done twice."""
     settings(root)
@@ -227,6 +228,7 @@ def test_a_stopped_table_leaves_with_75_and_continues(root: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*ASKED, "parts"])
+@pytest.mark.timeout(1800)
 def test_every_table_runs_to_its_end(root: Path, name: str) -> None:
     settings(root)
     run(root, name)
