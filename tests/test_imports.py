@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # a module may import from rooms on its own floor's list; the longest matching prefix of its name decides
 ALLOWED = {
     "shards": {"shards"},
-    "pipeline.config": {"shards"},
+    "pipeline.config": {"shards", "pipeline.config"},
     "pipeline.distributed": {"shards"},
     "pipeline.data": {"shards", "pipeline.config", "pipeline.distributed", "pipeline.data"},
     "pipeline.model": {"shards", "pipeline.config", "pipeline.distributed", "pipeline.data", "pipeline.model"},

@@ -15,8 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from pipeline.baseline_config import ResNetConfig
 from pipeline.config import ModelConfig
+from pipeline.config.baselines import ResNetConfig
 from pipeline.model.batch_norm import GlobalBatchNorm2d
 from shards.errors import UsageError
 

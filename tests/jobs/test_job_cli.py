@@ -13,7 +13,8 @@ from jobs.cli import parse
 from pipeline.config import EvaluationConfig, RunConfig
 from shards.errors import UsageError
 
-JOBS = ["prepare", "train", "evaluate", "compare", "miniature", "demo"]
+ROOT = Path(__file__).resolve().parents[2]
+JOBS = sorted(path.stem for path in (ROOT / "jobs").glob("*.py") if path.stem not in ("__init__", "cli"))
 
 
 def test_yaml_then_overrides_in_order(tmp_path: Path) -> None:

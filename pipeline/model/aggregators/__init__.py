@@ -11,13 +11,13 @@ from typing import Any
 
 from torch import nn
 
+from pipeline.config.model import PoolingConfig
 from pipeline.model.aggregators.boq import BoQ
 from pipeline.model.aggregators.cosplace import CosPlace
 from pipeline.model.aggregators.mixvpr import MixVPR
 from pipeline.model.aggregators.netvlad import NetVLAD
 from pipeline.model.aggregators.salad import SALAD
 from pipeline.model.pooling import Pooling
-from pipeline.model_config import PoolingConfig
 
 AGGREGATORS: dict[str, Callable[[PoolingConfig, int, int], nn.Module]] = {
     "netvlad": lambda config, dim, grid: NetVLAD(config.netvlad, dim),

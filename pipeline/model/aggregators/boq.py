@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from pipeline.baseline_config import BoQConfig
+from pipeline.config.baselines import BoQConfig
 from shards.errors import UsageError
 
 

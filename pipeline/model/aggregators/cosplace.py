@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pipeline.baseline_config import CosPlaceConfig
+from pipeline.config.baselines import CosPlaceConfig
 from pipeline.model.pooling import at_least_float32
 
 

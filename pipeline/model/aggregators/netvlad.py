@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pipeline.baseline_config import NetVLADConfig
+from pipeline.config.baselines import NetVLADConfig
 from pipeline.model.pooling import at_least_float32
 
 

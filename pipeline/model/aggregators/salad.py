@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pipeline.baseline_config import SALADConfig
+from pipeline.config.baselines import SALADConfig
 from pipeline.model.pooling import at_least_float32
 from shards.errors import UsageError
 

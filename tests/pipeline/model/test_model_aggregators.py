@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pipeline.baseline_config import BoQConfig, CosPlaceConfig, MixVPRConfig, NetVLADConfig, SALADConfig
 from pipeline.config import ModelConfig, PoolingConfig
+from pipeline.config.baselines import BoQConfig, CosPlaceConfig, MixVPRConfig, NetVLADConfig, SALADConfig
 from pipeline.model.aggregators import AGGREGATORS, build_pooling
 from pipeline.model.aggregators.netvlad import NetVLAD, k_means
 from pipeline.model.aggregators.salad import transport

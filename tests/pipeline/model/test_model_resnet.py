@@ -15,8 +15,8 @@ from processes import run_ranks
 from safetensors.torch import save_file
 from torch import Tensor
 
-from pipeline.baseline_config import ResNetConfig
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, PoolingConfig
+from pipeline.config.baselines import ResNetConfig
 from pipeline.data.images import normalise
 from pipeline.distributed import rank_slice
 from pipeline.model.resnet import ResNet

@@ -13,11 +13,11 @@ import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from pipeline.model_config import AdapterConfig as AdapterConfig
-from pipeline.model_config import BackboneConfig as BackboneConfig
-from pipeline.model_config import CrossImageConfig as CrossImageConfig
-from pipeline.model_config import ModelConfig as ModelConfig
-from pipeline.model_config import PoolingConfig as PoolingConfig
+from pipeline.config.model import AdapterConfig as AdapterConfig
+from pipeline.config.model import BackboneConfig as BackboneConfig
+from pipeline.config.model import CrossImageConfig as CrossImageConfig
+from pipeline.config.model import ModelConfig as ModelConfig
+from pipeline.config.model import PoolingConfig as PoolingConfig
 from shards.errors import UsageError
 
 

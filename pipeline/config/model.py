@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pipeline.baseline_config import BoQConfig, CosPlaceConfig, MixVPRConfig, NetVLADConfig, ResNetConfig, SALADConfig
+from pipeline.config.baselines import BoQConfig, CosPlaceConfig, MixVPRConfig, NetVLADConfig, ResNetConfig, SALADConfig
 
 BackboneName = Literal[
     "dinov2_vits14", "dinov2_vitb14", "dinov2_vitl14", "dinov2_vitg14",
