@@ -2,7 +2,7 @@
 
 Launches every engine for three SGD steps of a small model (`pipeline.training.agreement`) and prints the largest
 relative difference of any tensor's averaged gradient, and of the weights after the steps, from the same steps in one
-process in float64. Runs on CPU or GPUs, whichever `accelerate launch` finds; a minute on two cores.
+process in float64. Runs on CPU or GPUs, whichever `accelerate launch` finds; minutes on two cores.
 """
 
 from __future__ import annotations
