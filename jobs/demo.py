@@ -20,8 +20,8 @@ from jobs.cli import parse, run_job
 from shards.errors import UserError
 
 RUNS = {
-    "crica": "the whole method: adapters, spatial pyramid, cross-image encoder, global batch",
-    "no-crica": "the same without the cross-image encoder (AdaptSPM in the paper)",
+    "crica": "adapters, spatial pyramid, cross-image encoder, global batch (the paper's AdaptSPMG+Crica)",
+    "no-crica": "the same without the cross-image encoder (AdaptSPMG)",
 }
 
 
@@ -49,7 +49,7 @@ class StepFailed(UserError):
 
 def step(title: str, *command: str) -> None:
     """Prints and runs one command; its output goes to the terminal."""
-    words = [word if word != sys.executable else "python" for word in command]
+    words = [Path(word).name if word.startswith(str(Path(sys.executable).parent)) else word for word in command]
     print(
         f"\n\033[1m{title}\033[0m\n$ {' '.join(words)}" if sys.stdout.isatty() else f"\n== {title}\n$ {' '.join(words)}"
     )

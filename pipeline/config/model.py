@@ -39,8 +39,6 @@ class BackboneConfig:
     """custom: hidden width of the MLP over dim."""
     layerscale: float = 1.0
     """custom: initial LayerScale; 1.0 suits training from scratch, 1e-5 is DINOv2's own start."""
-    init_std: float = 0.02
-    """Deviation of random weights (DINOv2: 0.02); a narrow backbone trained from scratch wants about 1 / sqrt(dim)."""
     pretrain_grid: int = 37
     """custom: side of the stored position embedding's grid; it is resized once to the input's grid (DINOv2: 37)."""
     registers: int = 0

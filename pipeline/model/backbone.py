@@ -217,7 +217,6 @@ def _dinov2(size: Sizes, config: BackboneConfig) -> Any:
         "patch_size": size.patch,
         "use_swiglu_ffn": size.swiglu,
         "layerscale_value": config.layerscale,
-        "initializer_range": config.init_std,
         "attn_implementation": config.attention,
     }
     return _built(lambda: Dinov2Model(Dinov2Config(**settings)), config)
@@ -236,7 +235,6 @@ def _dinov3(size: Sizes, config: BackboneConfig) -> Any:
         "use_gated_mlp": size.swiglu,
         "hidden_act": "silu" if size.swiglu else "gelu",
         "layerscale_value": config.layerscale,
-        "initializer_range": config.init_std,
         "attn_implementation": config.attention,
         # the library would jitter positions in train mode: an image must be encoded alike in training and evaluation
         "pos_embed_rescale": None,

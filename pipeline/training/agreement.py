@@ -92,7 +92,7 @@ def measure(accelerator: Any, config: TrainConfig, dtype: torch.dtype, train: Tr
     gradients = engine.gradients(loss(data[0]))
     for images in data:
         engine.step(loss(images), RATE)
-    weights, _ = engine.state()
+    weights, _ = engine.state(list(engine.model.state_dict()))
     if not weights:
         return {}
     return {

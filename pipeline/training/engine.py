@@ -8,7 +8,7 @@ checkpoint does not know which engine or how many ranks wrote it.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -74,12 +74,15 @@ class Engine:
         self.optimizer.zero_grad(set_to_none=True)
         return found
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def state(self, wanted: Container[str]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Whole model tensors and optimiser tensors on the CPU (collective; complete on rank 0, empty elsewhere).
+
+        Args:
+            wanted: names of the model tensors to collect, the same on every rank.
 
         Optimiser tensors are named `<parameter>/<state>`, for example `cross_image.layers.0.linear1.weight/exp_avg`.
         """
-        model = self._collect(self.model.state_dict().items())
+        model = self._collect((n, t) for n, t in self.model.state_dict().items() if n in wanted)
         inner = getattr(self.optimizer, "optimizer", self.optimizer)
         moments = (
             (f"{name}/{key}", value if isinstance(value, Tensor) else torch.tensor(float(value)))

@@ -24,7 +24,7 @@ from pipeline.data.places import Batch, build_loader
 from pipeline.data.plan import plan
 from pipeline.distributed import any_rank, barrier, broadcast_object, rank, world_size
 from pipeline.model.vpr import PlaceModel, build_model
-from pipeline.model.weights import frozen_hash, load_trainable, save_model
+from pipeline.model.weights import frozen_hash, load_trainable, save_model, saved_names
 from pipeline.training import checkpoint
 from pipeline.training.checkpoint import RunState
 from pipeline.training.compiled import compile_backbone, uncompiled
@@ -80,6 +80,7 @@ class Trainer:
         torch.manual_seed(config.seed)
         model = build_model(config.model, config.data.image_size)
         self.backbone_hash = frozen_hash(model)
+        self.saved = frozenset(saved_names(model, config.model, everything=False))
         self.state, optimizer = self._resume(model)
         if self.state.step == 0 and not optimizer:
             initialise(model, self.index, config, accelerator.device)
@@ -205,7 +206,7 @@ class Trainer:
         """One checkpoint (collective): whole tensors are gathered on rank 0, which writes."""
         self.state.world_size = world_size()
         self.state.scaler = self.engine.scaler()
-        tensors, optimizer = self.engine.state()
+        tensors, optimizer = self.engine.state(self.saved)
         problem: UserError | None = None
         if self.main:
             try:

@@ -8,7 +8,7 @@ is imported only where a run was launched with it.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -79,10 +79,10 @@ class ZeroEngine(Engine):
         self.module.step()
         return found
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def state(self, wanted: Container[str]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         from deepspeed.utils import safe_get_full_optimizer_state
 
-        model = self._collect(self._tensors())
+        model = self._collect(self._tensors(wanted))
         held = self.optimizer.state.get(self._flat()[0], {})
         optimizer: dict[str, Tensor] = {}
         for name, parameter in self.names().items():
@@ -133,12 +133,14 @@ class ZeroEngine(Engine):
         flat = zero.fp32_partitioned_groups_flat if self.stage == 3 else zero.single_partition_of_fp32_groups
         return list(flat)
 
-    def _tensors(self) -> Iterator[tuple[str, Tensor]]:
-        """Every tensor of the model's state_dict, whole for as long as the caller looks at it (collective)."""
+    def _tensors(self, wanted: Container[str]) -> Iterator[tuple[str, Tensor]]:
+        """The wanted tensors of the model, each whole for as long as the caller looks at it (collective)."""
         import deepspeed
 
         parameters = dict(self.model.named_parameters())
         for name, tensor in self.model.state_dict().items():
+            if name not in wanted:
+                continue
             if self.stage == 3 and name in parameters:
                 with deepspeed.zero.GatheredParameters([parameters[name]]):
                     yield name, parameters[name].detach()
@@ -154,7 +156,7 @@ class ZeroEngine(Engine):
         self._template.to(self.accelerator.device)
         targets = self._template.state_dict()
         with torch.no_grad():
-            for name, tensor in self._tensors():
+            for name, tensor in self._tensors(self.model.state_dict()):
                 targets[name].copy_(tensor)
         self._template.eval()
         try:
