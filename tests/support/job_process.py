@@ -71,6 +71,10 @@ def _run(module: str, arguments: list[str], output: Path, environment: dict[str,
     sys.stdout, sys.stderr = os.fdopen(1, "w", buffering=1), os.fdopen(2, "w", buffering=1)
     for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGINT):
         signal.signal(number, signal.SIG_DFL if number != signal.SIGINT else signal.default_int_handler)
+    from accelerate.state import AcceleratorState, PartialState
+
+    AcceleratorState._reset_state(True)  # what an earlier test in the parent launched is not what this process is
+    PartialState._reset_state()
     torch.set_num_threads(1)  # OpenMP's threads do not survive a fork
     os.environ["OMP_NUM_THREADS"] = "1"
     job = importlib.import_module(module)

@@ -182,14 +182,14 @@ def recalls(queries: Tensor, database: Tensor, tolerance: int) -> list[float]:
 
 
 def test_keras_weights_want_their_layout(shared_dir: Path) -> None:
-    """Ten frames far apart: recognised in the weights' own layout, not so in torchvision's."""
+    """Twenty frames far apart, by day and by night: recognised in the weights' own layout, hardly in torchvision's."""
     found = {}
     for layout in ("keras", "torchvision"):
-        right, left = (
-            gardens_point(shared_dir, layout, traverse, 20, (160, 90)) for traverse in ("day_right", "day_left")
+        day, night = (
+            gardens_point(shared_dir, layout, traverse, 10, (160, 90)) for traverse in ("day_right", "night_right")
         )
-        found[layout] = recalls(right, left, 0)[0]
-    assert found["keras"] >= 80 and found["torchvision"] <= found["keras"] - 20
+        found[layout] = recalls(day, night, 0)[0]
+    assert found["keras"] >= 65 and found["torchvision"] <= found["keras"] - 25
 
 
 @pytest.mark.slow
