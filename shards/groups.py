@@ -25,7 +25,7 @@ from shards import index
 from shards.catalogue import Catalogue, LeftOut, runs
 from shards.images import ImageRule, Refused, admit
 from shards.rounds import IMAGES_A_PLACE, draw, permutation, rank
-from shards.shard_file import Member, ShardFile, sync_folder, write_atomically
+from shards.shard_file import Member, ShardFile, sync_path, write_atomically
 
 PART_SCHEMA = pa.schema(
     [("number", pa.int64()), ("good", pa.int32()), *(f for f in index.SCHEMA if f.name != "place")]
@@ -131,7 +131,7 @@ def write_group(task: GroupTask) -> int:
                     shard.finish(task.out / name)
                     told = {"name": name, "bytes": shard.size, "sha256": shard.sha256, "samples": shard.samples}
                     facts["shards"].append(told)
-            sync_folder(task.out)
+            sync_path(task.out)
         table = pa.Table.from_pylist(rows, PART_SCHEMA).replace_schema_metadata({"group": json.dumps(facts)})
         sink = pa.BufferOutputStream()
         pq.write_table(table, sink)

@@ -83,12 +83,12 @@ def write_atomically(path: Path, data: bytes, temporary: Path | None = None) -> 
         stream.flush()
         os.fsync(stream.fileno())
     temporary.rename(path)
-    sync_folder(path.parent)
+    sync_path(path.parent)
 
 
-def sync_folder(folder: Path) -> None:
-    """Makes renames in a folder last."""
-    handle = os.open(folder, os.O_RDONLY)
+def sync_path(path: Path) -> None:
+    """Forces a file's bytes, or a folder's names, to the disk."""
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from pipeline.config import RunConfig, flatten
 from shards.errors import DataError, UsageError
+from shards.shard_file import sync_path
 
 # Settings a resumed run may change: they decide where, how long and how fast, never what a step computes.
 FREE = (
@@ -93,8 +94,8 @@ def write(
     told = {"state": dataclasses.asdict(state), "config": flatten(config)}
     (temporary / "state.json").write_text(json.dumps(told, indent=1) + "\n")
     for file in temporary.iterdir():
-        sync(file)
-    sync(temporary)
+        sync_path(file)
+    sync_path(temporary)
     if target.exists():  # the same step again (an epoch's end that was also a save_every): the newer state wins
         stale = target.with_name(f".replaced-{target.name}-{os.getpid()}")
         target.rename(stale)
@@ -113,16 +114,7 @@ def point(run: Path, name: str, target: Path) -> None:
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(target.name)
     temporary.replace(link)
-    sync(link.parent)
-
-
-def sync(path: Path) -> None:
-    """Forces a file's bytes, or a folder's names, to the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    sync_path(link.parent)
 
 
 def prune(run: Path, keep: int) -> None:
