@@ -48,7 +48,7 @@ class RunState:
         run_id: MLflow run, "" when not recorded.
         index: digest of the shard set's index.
         world_size: ranks that wrote it (informative; any number may continue).
-        validated: the newest validation, metric name -> value.
+        validated: the newest validation, metric name -> value, and the step it was made at (None: not yet).
         start: the same before the first step, {} where it was not measured.
         scaler: loss scale of fp16, empty otherwise.
     """
@@ -63,6 +63,7 @@ class RunState:
     index: str = ""
     world_size: int = 1
     validated: dict[str, float] = dataclasses.field(default_factory=dict)
+    validated_step: int | None = None
     start: dict[str, float] = dataclasses.field(default_factory=dict)
     scaler: dict[str, float] = dataclasses.field(default_factory=dict)
 

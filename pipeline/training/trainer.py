@@ -126,6 +126,18 @@ class Trainer:
 
     def _epoch(self) -> None:
         """The rest of the current epoch, then validation and a checkpoint."""
+        state = self.state
+        if state.step < self.total_steps:
+            self._train_epoch()
+        if self.validation is not None:
+            self._save()  # validation can take minutes: a kill in it must not cost the epoch
+            self._validate()
+        if state.cursor >= self.steps_per_epoch:  # only now: until it is validated, an epoch is not over
+            state.epoch, state.cursor = state.epoch + 1, 0
+        self._save()
+
+    def _train_epoch(self) -> None:
+        """The steps that are left of the current epoch."""
         state, config = self.state, self.config
         loader = build_loader(self.index, config.data, config.seed, state.epoch, state.cursor, rank(), world_size())
         self.engine.model.train()
@@ -141,12 +153,6 @@ class Trainer:
                     break  # train.steps falls inside the epoch
                 if state.step % config.train.save_every == 0 and state.cursor < self.steps_per_epoch:
                     self._save()
-        if state.cursor >= self.steps_per_epoch:
-            state.epoch, state.cursor = state.epoch + 1, 0
-        if self.validation is not None:
-            self._save()  # validation can take minutes: a kill in it must not cost the epoch
-            self._validate()
-        self._save()
 
     def _step(self, batch: Batch, meter: Meter) -> None:
         state, config = self.state, self.config
@@ -192,7 +198,7 @@ class Trainer:
         assert self.validation is not None
         with self.engine.plain() as model, uncompiled(self.config.train.compile):
             values, score = self.validation.run(model, self.main)
-        self.state.validated = values
+        self.state.validated, self.state.validated_step = values, self.state.step
         self.tracker.metrics(values, self.state.step)
         if self.state.step == 0:
             self.state.start = values
@@ -290,7 +296,8 @@ class Trainer:
     def _ended(self) -> str:
         """Why the run is over, or ""."""
         state, train = self.state, self.config.train
-        if state.step >= self.total_steps:
+        validated = self.validation is None or state.validated_step == state.step
+        if state.step >= self.total_steps and validated:
             return "steps" if train.steps is not None and state.step >= train.steps else "epochs"
         if train.patience and state.stale >= train.patience:
             return "patience"

@@ -237,3 +237,27 @@ def test_recorded_in_mlflow_and_continued_there(root: Path) -> None:
     assert any(Path(m.tags["checkpoint"]).joinpath("model.safetensors").exists() for m in models)
     artifacts = {a.path for a in client.list_artifacts(run.info.run_id)}
     assert {"config.yaml", "environment.yaml"} <= artifacts
+
+
+@pytest.mark.parametrize("changes", [{}, {"train__steps": 10}])
+def test_a_kill_in_the_last_validation_does_not_lose_it(root: Path, whole: str, changes: dict[str, Any]) -> None:
+    """The last step is saved before its validation; what a kill in between leaves must still be validated."""
+    name = f"unvalidated{len(changes)}"
+    path = config(root, name, **changes)
+    train(path)
+    finished = json.loads((root / "outputs" / name / "checkpoints/last/state.json").read_text())
+    path = config(root, f"{name}-killed", **changes)
+    job = start(path)
+    state = root / "outputs" / path.stem / "checkpoints/last/state.json"
+    last = finished["state"]["step"]
+    job.kill_when(lambda: state.exists() and f'"step": {last},' in state.read_text(), timeout=60)
+    job.wait()
+    left = json.loads(state.read_text())["state"]
+    out = train(path)
+    again = json.loads(state.read_text())["state"]
+    assert left["validated_step"] != last, "killed too late: the validation was already saved"
+    assert again["validated_step"] == last
+    assert "validation" in out
+    for key in ("step", "epoch", "cursor", "validated", "best", "best_step", "stale"):
+        assert again[key] == finished["state"][key], key
+    assert same_bits(weights(root, path.stem), weights(root, name))
