@@ -85,17 +85,13 @@ def _measure(job: EnginesJob, file: str) -> None:
 
     from pipeline.config import TrainConfig
     from pipeline.training.agreement import measure
-    from pipeline.training.launch import finish, start
+    from pipeline.training.launch import launched
 
-    accelerator = start(timeout=300.0)
-    try:
+    with launched(timeout=300.0) as accelerator:
         config = TrainConfig(encode_chunk=job.encode_chunk)
         tensors = measure(accelerator, config, getattr(torch, job.dtype), job.train)
         if tensors:
             save_file({name: t.contiguous() for name, t in tensors.items()}, file)
-    finally:
-        del accelerator
-        finish()
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from jobs.cli import parse, run_job
 from pipeline.config import EvaluationConfig, to_dict
-from shards.errors import DataError, UsageError, UserError
+from shards.errors import DataError, UsageError
 
 
 @dataclass(frozen=True)
@@ -41,18 +41,10 @@ def main() -> None:
     if not job.checkpoint:
         raise UsageError("--checkpoint is missing: a run folder such as outputs/cricavpr, or a model file")
     config = EvaluationConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(EvaluationConfig)})
-    from pipeline.training.launch import finish, start
+    from pipeline.training.launch import launched
 
-    accelerator = start(job.timeout)
-    try:
+    with launched(job.timeout) as accelerator:
         run(job, config, accelerator)
-    except UserError as error:
-        if accelerator.is_main_process:
-            raise
-        sys.exit(error.exit_code)  # rank 0 tells it
-    finally:
-        del accelerator
-        finish()
 
 
 def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from jobs.cli import parse, run_job
 from pipeline.config import EvaluationConfig, RunConfig
-from shards.errors import DataError, UsageError, UserError
+from shards.errors import DataError, UsageError
 
 
 @dataclass(frozen=True)
@@ -84,18 +84,10 @@ def main() -> None:
 def measure(order: Path, timeout: float) -> None:
     """The evaluations of one trained run, on every process that was launched."""
     from pipeline.experiments.measure import measure as carry_out
-    from pipeline.training.launch import finish, start
+    from pipeline.training.launch import launched
 
-    accelerator = start(timeout)
-    try:
+    with launched(timeout) as accelerator:
         carry_out(order, accelerator)
-    except UserError as error:
-        if accelerator.is_main_process:
-            raise
-        sys.exit(error.exit_code)  # rank 0 tells it
-    finally:
-        del accelerator
-        finish()
 
 
 if __name__ == "__main__":

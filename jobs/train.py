@@ -10,12 +10,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 from jobs.cli import parse, run_job
-from pipeline.config import RunConfig
+from pipeline.config import RunConfig, to_dict
 from shards.errors import UserError
 
 
@@ -31,15 +30,12 @@ def main() -> None:
     """Parses, trains, says how it ended."""
     job = parse(TrainJob, __doc__ or "")
     config = RunConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(RunConfig)})
-    from pipeline.training.launch import finish, start
+    from pipeline.training.launch import launched
 
-    accelerator = start(config.train.timeout)
-    first = accelerator.is_main_process
-    try:
+    with launched(config.train.timeout) as accelerator:
+        first = accelerator.is_main_process
         if first:
             import yaml
-
-            from pipeline.config import to_dict
 
             print(yaml.safe_dump(to_dict(config), sort_keys=False), flush=True)
         if job.dry_run:
@@ -49,9 +45,6 @@ def main() -> None:
                 print(show(preview(config)))
             return
         train(config, accelerator, first)
-    finally:
-        del accelerator
-        finish()
 
 
 def train(config: RunConfig, accelerator: object, first: bool) -> None:
@@ -70,8 +63,6 @@ def train(config: RunConfig, accelerator: object, first: bool) -> None:
             print(f"{outcome.run}: {message}", flush=True)
     except UserError as error:
         status = {"exit_code": error.exit_code, "message": str(error)}
-        if not first:
-            sys.exit(error.exit_code)  # rank 0 tells it
         raise
     finally:
         run = Path(config.output) / config.name

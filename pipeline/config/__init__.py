@@ -8,7 +8,6 @@ except where the docstring says "ours".
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -218,11 +217,6 @@ def flatten(config: Any) -> dict[str, Any]:
 
     walk("", to_dict(config))
     return flat
-
-
-def digest(config: Any) -> str:
-    """Sixteen hex digits that identify a config's values."""
-    return hashlib.sha256(json.dumps(to_dict(config), sort_keys=True).encode()).hexdigest()[:16]
 
 
 def from_dict(kind: type, values: dict[str, Any], where: str = "") -> Any:

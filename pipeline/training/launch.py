@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ import torch
 import torch.distributed as dist
 
 from pipeline.distributed import is_distributed
-from shards.errors import UsageError
+from shards.errors import UsageError, UserError
 
 ADVICE = "launch with: accelerate launch --config_file jobs/accelerate/<engine>.yaml -m jobs.train --config FILE"
 
@@ -97,6 +98,24 @@ def stop_signals() -> Iterator[list[int]]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def launched(timeout: float) -> Iterator[Any]:
+    """`start` around a job's body, and the end of the process group after it, however the body ends.
+
+    A `UserError`, which all ranks raise alike, is raised on rank 0 alone: the others leave with its exit code.
+    """
+    accelerator = start(timeout)
+    try:
+        yield accelerator
+    except UserError as error:
+        if accelerator.is_main_process:
+            raise
+        sys.exit(error.exit_code)
+    finally:
+        accelerator.free_memory()  # the caller still holds it, and it holds what it wrapped
+        finish()
 
 
 def finish() -> None:
