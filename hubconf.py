@@ -3,9 +3,9 @@
     import torch
     model = torch.hub.load("FOLDER", "place_model", source="local", path="outputs/cricavpr")
 
-Entries: `place_model` (any model of this project, or a released CricaVPR), `place_input` (photo -> input), and every
-variant by the paper's name, as in `torch.hub.load("FOLDER", "AdaptSPM+Crica", source="local")`. Invariant: importing
-this file builds nothing, and what an entry returns is in eval mode.
+Entries: `place_model` (any model of this project, or a release of CricaVPR or another method), `place_input` (photo ->
+input), and every variant by the paper's name, as in `torch.hub.load("FOLDER", "AdaptSPM+Crica", source="local")`.
+Invariant: importing this file builds nothing, and what an entry returns is in eval mode.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ dependencies = ["torch", "transformers", "safetensors", "numpy", "PIL"]
 
 
 def place_model(path: str, device: str = "cpu", image_size: int | None = None) -> PlaceModel:
-    """The model of a run folder, a checkpoint folder, a file of ours, or a released CricaVPR .pth, in eval mode.
+    """The model of a run folder, a checkpoint folder, a file of ours, or a release of a whole model, in eval mode.
 
     `model(images [b, 3, S, S])` gives unit descriptors [b, R*D]; the b images are one group of the cross-image
     encoder, so pass them one at a time (or see `groups` in the documentation of the evaluation).
@@ -32,7 +32,7 @@ def place_model(path: str, device: str = "cpu", image_size: int | None = None) -
     Args:
         path: where the weights are.
         device: where the model goes.
-        image_size: side S of the input in pixels; none: what the file says, 224 for a release.
+        image_size: side S of the input in pixels; none: what the file says, the method's own for a release.
 
     Raises:
         UsageError: nothing there, or weights that do not fit; DataError: a broken file.

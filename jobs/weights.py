@@ -2,6 +2,7 @@
 
     python -m jobs.weights --source dinov2_vitb14_pretrain.pth --to weights/dinov2_vitb14.safetensors
     python -m jobs.weights --source CricaVPR.pth --to weights/cricavpr.safetensors
+    python -m jobs.weights --source ResNet50_512_cosplace.pth --to weights/cosplace.safetensors
     python -m jobs.weights --source outputs/RUN --to weights/mine.safetensors
     python -m jobs.weights --source outputs/RUN --to weights/mine.onnx
 
@@ -32,20 +33,24 @@ class WeightsJob:
     """Describe, import or export weights."""
 
     source: str = ""
-    """A run or checkpoint folder, a file of ours, a released CricaVPR or DINOv2 .pth, a transformers folder or hub
-    name."""
+    """A run or checkpoint folder, a file of ours, a released CricaVPR or DINOv2 .pth, a release of another method
+    (CosPlace, EigenPlaces, MixVPR, SALAD, BoQ, NetVLAD, SFRS, GCL), a transformers folder or hub name."""
     to: str = ""
     """The file to write: .safetensors, .pth or .onnx; none: only tell what the source is."""
-    kind: Literal["auto", "model", "cricavpr", "backbone"] = "auto"
-    """What the source must be; auto looks."""
+    kind: Literal[
+        "auto", "model", "cricavpr", "backbone",
+        "cosplace", "mixvpr", "salad", "boq", "netvlad", "sfrs", "gcl", "gcl_avg", "gem",
+    ] = "auto"  # fmt: skip
+    """What the source must be; auto looks. cosplace is EigenPlaces too; gcl_avg must be said, its average pooling
+    leaves no trace in the file."""
     image_size: int | None = None
-    """Side of the input in pixels; none: what the file says, 224 for released weights."""
+    """Side of the input in pixels; none: what the file says, for released weights the method's own (CricaVPR: 224)."""
     variant: str = ""
     """For a backbone: write the whole model of the paper's variant around it, untrained."""
     onnx: Literal["descriptors", "regions"] = "descriptors"
     """.onnx: descriptors with each image as its own group, or the regional features before the cross-image encoder."""
     model: ModelConfig = field(default_factory=ModelConfig)
-    """Sizes where released weights are not the paper's; a backbone's name is found by its width and depth."""
+    """Sizes where a released CricaVPR or backbone is not the paper's; other methods' releases tell their own."""
 
 
 def main() -> None:
@@ -76,7 +81,7 @@ def main() -> None:
         model = exchange.around_backbone(job.source, config, job.image_size)
     else:
         model = exchange.read_model(job.source, kind, job.model, job.image_size)
-    print(f"{job.source}: {exchange.KINDS[found]}")
+    print(f"{job.source}: {exchange.KINDS[kind if found == 'unpooled' else found]}")
     _describe(model)
     if target is not None:
         _write(model, target, job)

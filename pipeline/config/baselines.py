@@ -1,4 +1,4 @@
-"""Settings of the baselines' parts: residual networks and aggregators; `pipeline.config` holds them in its own.
+"""Settings of the baselines' parts: residual networks, VGG-16 and aggregators; `pipeline.config` holds them in its own.
 
 Invariant: defaults are the sizes published with each method, so that a name alone gives the published shape. No torch.
 """
@@ -11,10 +11,11 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class ResNetConfig:
-    """A residual network of bottlenecks, as far as it is used."""
+    """A residual network, as far as it is used."""
 
     cut: Literal["layer2", "layer3", "layer4"] = "layer4"
-    """Last stage used: layer3 has stride 16 and 1024 channels, layer4 stride 32 and 2048."""
+    """Last stage used: layer3 has stride 16 and 1024 channels (256 in ResNet-18 and 34), layer4 stride 32 and twice
+    as many."""
     layout: Literal["torchvision", "keras"] = "torchvision"
     """Whose weights: keras puts a down-sampling bottleneck's stride in its first convolution, has BatchNorm eps
     1.001e-5 and takes BGR 0..255 minus means (converted inside: the model's input stays the same)."""
@@ -22,6 +23,18 @@ class ResNetConfig:
     """resnet_custom: bottlenecks of the four stages."""
     width: int = 64
     """resnet_custom: channels after the first convolution; a stage's output is 4, 8, 16, 32 times as wide."""
+
+
+@dataclass(frozen=True)
+class VGGConfig:
+    """VGG-16, as far as it is used."""
+
+    cut: Literal["conv5_3", "pool5"] = "conv5_3"
+    """conv5_3: the last convolution without its ReLU, stride 16 (NetVLAD, SFRS, CosPlace); pool5: ReLU and pooling
+    too, stride 32 (GCL). Both have 512 channels."""
+    layout: Literal["torchvision", "matconvnet"] = "torchvision"
+    """Whose weights: matconvnet's, which SFRS starts from, take RGB 0..255 minus means (converted inside: the model's
+    input stays the same)."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +47,11 @@ class NetVLADConfig:
     """Patch features that k-means starts the centres from, before the first step (published: 50,000)."""
     per_image: int = 100
     """Of them at most this many an image (published: 100)."""
+    bias: bool = False
+    """A bias in the assignment, which then is by distance to the centres, not by angle (`vladv2` in releases)."""
+    projection: int = 0
+    """Dimensions of a linear layer behind the normalised residuals, the PCA with whitening of SFRS' release (4096); 0
+    leaves the residuals as they are. Not set from images."""
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from pipeline.config.baselines import BoQConfig, CosPlaceConfig, MixVPRConfig, NetVLADConfig, ResNetConfig, SALADConfig
+from pipeline.config.baselines import (
+    BoQConfig,
+    CosPlaceConfig,
+    MixVPRConfig,
+    NetVLADConfig,
+    ResNetConfig,
+    SALADConfig,
+    VGGConfig,
+)
 
 BackboneName = Literal[
     "dinov2_vits14", "dinov2_vitb14", "dinov2_vitl14", "dinov2_vitg14",
     "dinov2_vits14_reg", "dinov2_vitb14_reg", "dinov2_vitl14_reg", "dinov2_vitg14_reg",
     "dinov3_vits16", "dinov3_vits16plus", "dinov3_vitb16", "dinov3_vitl16", "dinov3_vith16plus",
-    "resnet50", "resnet101", "custom", "resnet_custom",
+    "resnet18", "resnet34", "resnet50", "resnet101", "resnet152", "resnext101_32x8d", "vgg16",
+    "custom", "resnet_custom",
 ]  # fmt: skip
 PoolingKind = Literal["spm", "spmg", "gem", "cls", "netvlad", "cosplace", "mixvpr", "salad", "boq"]
 
@@ -24,7 +33,7 @@ class BackboneConfig:
     """The image encoder. `name` fills the sizes; `custom` and `resnet_custom` take them from the fields below."""
 
     name: BackboneName = "dinov2_vitb14"
-    """DINOv2 (paper: ViT-B/14 without registers), with registers, DINOv3, a residual network, or custom."""
+    """DINOv2 (paper: ViT-B/14 without registers), with registers, DINOv3, a residual network, VGG-16, or custom."""
     weights: str | None = None
     """Released weights: a .pth, a safetensors file, a transformers folder or hub name; none: random weights."""
     dim: int = 768
@@ -47,8 +56,12 @@ class BackboneConfig:
     """custom: DINOv3's rotary positions instead of a stored position embedding."""
     attention: Literal["sdpa", "eager", "flash_attention_2", "flex_attention"] = "sdpa"
     """Attention implementation of transformers."""
+    final_norm: bool = True
+    """Transformers: the norm after the last block, which DINOv2's own tokens have; BoQ's release leaves it out."""
     resnet: ResNetConfig = field(default_factory=ResNetConfig)
     """Residual networks: the part used, the origin of the weights, sizes of resnet_custom."""
+    vgg: VGGConfig = field(default_factory=VGGConfig)
+    """VGG-16: the part used and the origin of the weights."""
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,8 @@ class Embeddings(nn.Module):
 
 
 class Backbone(nn.Module):
-    """DINOv2 or DINOv3 with adapters: [b, 3, S, S] normalised images -> [b, 1 + G*G, D] tokens after the final norm.
+    """DINOv2 or DINOv3 with adapters: [b, 3, S, S] normalised images -> [b, 1 + G*G, D] tokens after the final norm
+    (or before it, `final_norm: false`).
 
     Args:
         config: the model's config; used are its backbone, its adapter, and what of them is trained.
@@ -153,13 +154,15 @@ class Backbone(nn.Module):
         if config.train == "last" and not 1 <= config.last_blocks <= size.depth:
             raise UsageError(f"model.last_blocks {config.last_blocks} must lie between 1 and the depth {size.depth}")
         self.dim, self.depth, self.grid = size.dim, size.depth, image_size // size.patch
-        self.registers, self.rope = size.registers, size.rope
+        self.registers, self.rope, self.final_norm = size.registers, size.rope, config.backbone.final_norm
         weights = config.backbone.weights
         # with released weights the random start would only cost time: shapes first, tensors from the file
         with torch.device("meta") if weights else contextlib.nullcontext():
             self.vit: Any = (_dinov3 if size.rope else _dinov2)(size, config.backbone)
             if not size.rope:
                 self.vit.embeddings = Embeddings(self.vit.embeddings, self.grid, size.registers)
+            if not config.backbone.final_norm:
+                setattr(self.vit, "norm" if size.rope else "layernorm", nn.Identity())
         if size.rope:  # its frequencies follow from the config and are in no file: real also where all else is shapes
             with torch.device("cpu"):
                 self.vit.rope_embeddings = type(self.vit.rope_embeddings)(self.vit.config)

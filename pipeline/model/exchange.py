@@ -11,7 +11,6 @@ import dataclasses
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -20,6 +19,7 @@ from pipeline.config import BackboneConfig, ModelConfig
 from pipeline.model.backbone import SIZES
 from pipeline.model.names import fit, to_published
 from pipeline.model.pretrained import backbone_tensors, dinov3_tensors, read_tensors
+from pipeline.model.releases import RELEASES, from_release, recognise
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights import (
     PUBLISHED_SIZE,
@@ -31,16 +31,16 @@ from pipeline.model.weights import (
 )
 from shards.errors import DataError, UsageError
 
-Kind = Literal["model", "cricavpr", "backbone"]
-KINDS: dict[Kind, str] = {
+KINDS: dict[str, str] = {
     "model": "a model of this project",
     "cricavpr": "a released CricaVPR",
     "backbone": "a backbone",
-}
+} | RELEASES
 
 
-def kind_of(source: str) -> Kind:
-    """What lies at a path or under a hub name; a file of ours is told by its metadata, all others by tensor names.
+def kind_of(source: str) -> str:
+    """What lies at a path or under a hub name, a key of KINDS; a file of ours is told by its metadata, all others by
+    tensor names.
 
     Raises:
         UsageError: nothing there; DataError: a broken file, or a pickle that holds more than tensors.
@@ -52,19 +52,22 @@ def kind_of(source: str) -> Kind:
     return _kind(read_tensors(source))
 
 
-def _kind(tensors: Mapping[str, Tensor]) -> Kind:
-    published = any(n.startswith(("encoder.layers.", "aggregation.")) or ".adapter." in n for n in tensors)
+def _kind(tensors: Mapping[str, Tensor]) -> str:
+    release = recognise(tensors)
+    if release is not None:
+        return release
+    published = any(n.startswith(("encoder.layers.", "aggregation.1.p")) or ".adapter." in n for n in tensors)
     return "cricavpr" if published else "backbone"
 
 
-def read_model(source: str, kind: Kind, config: ModelConfig, image_size: int | None) -> PlaceModel:
-    """A whole model in eval mode: one of ours, or a released CricaVPR.
+def read_model(source: str, kind: str, config: ModelConfig, image_size: int | None) -> PlaceModel:
+    """A whole model in eval mode: one of ours, a released CricaVPR, or a release of another method.
 
     Args:
         source: a run or checkpoint folder or file of ours; a .pth or safetensors file of published names.
-        kind: "model" or "cricavpr".
-        config: sizes of the published model; ours says its own.
-        image_size: side of the input in pixels; none: what the file says, else 224.
+        kind: "model", "cricavpr" or one of RELEASES.
+        config: sizes of the published CricaVPR; all others say their own.
+        image_size: side of the input in pixels; none: what the file says, else the method's own (CricaVPR: 224).
 
     Raises:
         UsageError: nothing there, another kind, names or shapes that do not fit; DataError: broken.
@@ -73,6 +76,8 @@ def read_model(source: str, kind: Kind, config: ModelConfig, image_size: int | N
         model = load_model(Path(source).expanduser())
         return model if image_size in (None, model.image_size) else at_size(model, image_size or 0)
     tensors = read_tensors(source)
+    if kind in RELEASES:
+        return from_release(tensors, source, kind, image_size)
     if _kind(tensors) != "cricavpr":
         raise UsageError(f"{source}: no released CricaVPR, it has neither adapters nor a cross-image encoder")
     return from_published(tensors, source, image_size or PUBLISHED_SIZE, config)

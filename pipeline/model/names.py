@@ -16,6 +16,8 @@ from torch import Tensor, nn
 
 from shards.errors import UsageError
 
+# VGG-16: torchvision's number of each stage's first convolution, in one list with ReLUs and poolings
+VGG_FIRST = {1: 0, 2: 5, 3: 10, 4: 17, 5: 24}
 # ours -> published, each applied where it matches; q, k, v and the SwiGLU parts are numbered by PARTS
 RENAMES: list[tuple[re.Pattern[str], Any]] = [
     (re.compile(pattern), replacement)
@@ -36,6 +38,7 @@ RENAMES: list[tuple[re.Pattern[str], Any]] = [
         (r"\.adapter\.up\.", ".adapter.D_fc2."),
         (r"\.adapter\.paths\.(\d+)\.", lambda m: f".adapter.branch{int(m[1]) + 1}."),
         (r"(\.adapter\.branch.*)\.norm\.", r"\1.bn."),
+        (r"^backbone\.stage(\d)\.(\d)\.", lambda m: f"backbone.features.{VGG_FIRST[int(m[1])] + 2 * int(m[2])}."),
         (r"^pooling\.p$", "aggregation.1.p"),
         (r"^cross_image\.", "encoder."),
     ]

@@ -143,7 +143,8 @@ def backbone_tensors(tensors: Mapping[str, Tensor], source: str, registers: bool
     if "encoder.layer.0.norm1.weight" in bare:
         own = {f"backbone.vit.{n}": t for n, t in bare.items() if not n.startswith("classifier.")}
         return to_published(own)
-    raise UsageError(f"{source}: no DINOv2 weights in it (first tensor: '{published_name(next(iter(bare)))[0]}')")
+    first = published_name(next(iter(bare)))[0]
+    raise UsageError(f"{source}: no DINOv2 weights in it, nor a release that is known here (first tensor: '{first}')")
 
 
 def load_backbone(backbone: Any, source: str, kind: str) -> None:
@@ -156,6 +157,8 @@ def load_backbone(backbone: Any, source: str, kind: str) -> None:
     given = read_tensors(source)
     tensors = dinov3_tensors(given, source) if rope else backbone_tensors(given, source, registers)
     width = tensors["backbone.norm.weight"].shape[0] if "backbone.norm.weight" in tensors else 0
+    if not backbone.final_norm:
+        tensors = {name: t for name, t in tensors.items() if not name.startswith("backbone.norm.")}
     # unused; some exports leave it out
     tensors.setdefault("backbone.mask_token", torch.zeros((1, 1, width) if rope else (1, width)))
     floats = {name: t.float() for name, t in tensors.items()}
@@ -224,4 +227,15 @@ def load_resnet(backbone: nn.Module, source: str, kind: str) -> None:
     for name in own:  # only counts batches; some exports leave it out
         if name.endswith("num_batches_tracked"):
             tensors.setdefault(f"backbone.{name}", torch.tensor(0))
+    fit(backbone, tensors, f"{source} (for backbone.name {kind})", prefix="backbone.", assign=True)
+
+
+def load_vgg(backbone: nn.Module, source: str, kind: str) -> None:
+    """Loads torchvision-named weights, as float32, into VGG-16; its classifier stays out.
+
+    Raises:
+        UsageError: nothing at that path, or weights of another network; DataError: a broken file.
+    """
+    given = read_tensors(source)
+    tensors = {f"backbone.{name}": t.float() for name, t in given.items() if not name.startswith("classifier.")}
     fit(backbone, tensors, f"{source} (for backbone.name {kind})", prefix="backbone.", assign=True)

@@ -1,4 +1,4 @@
-"""Residual networks of bottlenecks (He et al., CVPR 2016) as image encoders: the baselines' backbone.
+"""Residual networks (He et al., CVPR 2016; ResNeXt: Xie et al., CVPR 2017) as image encoders: the baselines' backbone.
 
 Invariant: tensors carry torchvision's names; the output has the form of the other backbones, patches row by row behind
 one token for the whole image, here their mean (what the network's own classifier reads). Frozen stages keep the
@@ -20,7 +20,16 @@ from pipeline.config.baselines import ResNetConfig
 from pipeline.model.batch_norm import GlobalBatchNorm2d
 from shards.errors import UsageError
 
-STAGES: dict[str, tuple[int, ...]] = {"resnet50": (3, 4, 6, 3), "resnet101": (3, 4, 23, 3)}
+STAGES: dict[str, tuple[int, ...]] = {
+    "resnet18": (2, 2, 2, 2),
+    "resnet34": (3, 4, 6, 3),
+    "resnet50": (3, 4, 6, 3),
+    "resnet101": (3, 4, 23, 3),
+    "resnet152": (3, 8, 36, 3),
+    "resnext101_32x8d": (3, 4, 23, 3),
+}
+BASIC = ("resnet18", "resnet34")  # two 3x3 convolutions a block instead of a bottleneck
+GROUPS = {"resnext101_32x8d": 32}  # of the middle convolution, which is then four times as wide
 EPS = {"torchvision": 1e-5, "keras": 1.001e-5}
 # the model's input is normalised with ImageNet's mean and deviation (RGB, 0..1); Keras' weights want BGR less means
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -29,18 +38,24 @@ KERAS_MEANS = (103.939, 116.779, 123.68)
 
 def is_resnet(name: str) -> bool:
     """Whether a backbone's name means a residual network."""
-    return name.startswith("resnet")
+    return name.startswith(("resnet", "resnext"))
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3, 1x1 with a skip; the stride sits in the 3x3 (torchvision) or in the first 1x1 (Keras)."""
+    """1x1, 3x3, 1x1 with a skip; the stride sits in the 3x3 (torchvision) or in the first 1x1 (Keras).
 
-    def __init__(self, channels: int, width: int, stride: int, layout: str) -> None:
+    In groups (ResNeXt) the middle is four times as wide: 32 groups of 8 at the first stage, where others have 64.
+    """
+
+    expansion = 4
+
+    def __init__(self, channels: int, width: int, stride: int, layout: str, groups: int = 1) -> None:
         super().__init__()
         out, eps, early = 4 * width, EPS[layout], layout == "keras"
+        width = width if groups == 1 else 4 * width
         self.conv1 = nn.Conv2d(channels, width, 1, stride if early else 1, bias=False)
         self.bn1 = GlobalBatchNorm2d(width, eps=eps)
-        self.conv2 = nn.Conv2d(width, width, 3, 1 if early else stride, padding=1, bias=False)
+        self.conv2 = nn.Conv2d(width, width, 3, 1 if early else stride, padding=1, groups=groups, bias=False)
         self.bn2 = GlobalBatchNorm2d(width, eps=eps)
         self.conv3 = nn.Conv2d(width, out, 1, bias=False)
         self.bn3 = GlobalBatchNorm2d(out, eps=eps)
@@ -56,6 +71,31 @@ class Bottleneck(nn.Module):
         x = F.relu(self.bn1(self.conv1(x)))
         x = F.relu(self.bn2(self.conv2(x)))
         return F.relu(self.bn3(self.conv3(x)) + skip)
+
+
+class BasicBlock(nn.Module):
+    """3x3, 3x3 with a skip (ResNet-18 and 34); the stride sits in the first."""
+
+    expansion = 1
+
+    def __init__(self, channels: int, width: int, stride: int, layout: str) -> None:
+        super().__init__()
+        eps = EPS[layout]
+        self.conv1 = nn.Conv2d(channels, width, 3, stride, padding=1, bias=False)
+        self.bn1 = GlobalBatchNorm2d(width, eps=eps)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1, bias=False)
+        self.bn2 = GlobalBatchNorm2d(width, eps=eps)
+        self.downsample: nn.Sequential | None = None
+        if stride != 1 or channels != width:
+            self.downsample = nn.Sequential(
+                nn.Conv2d(channels, width, 1, stride, bias=False), GlobalBatchNorm2d(width, eps=eps)
+            )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[b, channels, H, W] -> [b, width, H / stride, W / stride]."""
+        skip = x if self.downsample is None else self.downsample(x)
+        x = F.relu(self.bn1(self.conv1(x)))
+        return F.relu(self.bn2(self.conv2(x)) + skip)
 
 
 class ResNet(nn.Module):
@@ -109,6 +149,8 @@ class ResNet(nn.Module):
 
     def _build(self, settings: ResNetConfig, stages: tuple[int, ...], name: str) -> None:
         width = 64 if name in STAGES else settings.width
+        block: Any = BasicBlock if name in BASIC else Bottleneck
+        groups = {"groups": GROUPS[name]} if name in GROUPS else {}
         if len(stages) < self.depth:
             raise UsageError(f"backbone.resnet.stages {stages} has fewer stages than {settings.cut}")
         self.conv1 = nn.Conv2d(3, width, 7, 2, padding=3, bias=False)
@@ -118,8 +160,8 @@ class ResNet(nn.Module):
             narrow = width * 2**i
             blocks = []
             for j in range(stages[i]):
-                blocks.append(Bottleneck(channels, narrow, 2 if i > 0 and j == 0 else 1, settings.layout))
-                channels = 4 * narrow
+                blocks.append(block(channels, narrow, 2 if i > 0 and j == 0 else 1, settings.layout, **groups))
+                channels = block.expansion * narrow
             self.add_module(f"layer{i + 1}", nn.Sequential(*blocks))
         self.dim = channels
         for module in self.modules():

@@ -78,7 +78,7 @@ BASELINES: dict[str, dict[str, Any]] = {
     "ResNet50-SPM+Crica": _resnet("layer4", 2) | {"cross_image.layers": 2},
     # on DINOv2, what one would pick today
     "SALAD": _dinov2(4) | _pool("salad"),
-    "BoQ": _dinov2(2) | _pool("boq"),
+    "BoQ": _dinov2(2) | _pool("boq") | {"backbone.final_norm": False},
     # the older aggregators on the paper's backbone: what the backbone alone is worth
     "DINOv2-NetVLAD": _dinov2(4) | _pool("netvlad"),
     "DINOv2-GeM": _dinov2(4) | GEM,

@@ -19,6 +19,7 @@ from pipeline.model.cross_image import CrossImageEncoder
 from pipeline.model.lockstep import in_step, recomputed
 from pipeline.model.pooling import at_least_float32
 from pipeline.model.resnet import ResNet, is_resnet
+from pipeline.model.vgg import VGG
 from shards.errors import UsageError
 
 
@@ -38,7 +39,9 @@ class PlaceModel(nn.Module):
         super().__init__()
         self.config = config
         self.image_size = image_size
-        self.backbone: Backbone | ResNet = (ResNet if is_resnet(config.backbone.name) else Backbone)(config, image_size)
+        name = config.backbone.name
+        kind: type[Backbone | ResNet | VGG] = ResNet if is_resnet(name) else VGG if name == "vgg16" else Backbone
+        self.backbone: Backbone | ResNet | VGG = kind(config, image_size)
         self.pooling = build_pooling(config.pooling, self.backbone.dim, self.backbone.grid)
         self.cross_image = CrossImageEncoder(self.pooling.dim, config.cross_image)
         self.regions = self.pooling.regions
@@ -69,6 +72,7 @@ class PlaceModel(nn.Module):
             if isinstance(self.backbone, ResNet):
                 tokens = self.backbone(images, recompute=True)
             else:
+                assert isinstance(self.backbone, Backbone)  # VGG has no BatchNorm
                 with in_step(self.backbone, chunk):
                     tokens = self.backbone(images)
             return torch.cat([recomputed(self.pooling, part) for part in tokens.split(chunk)])

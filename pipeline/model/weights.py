@@ -50,7 +50,7 @@ def from_published(
         name: t if t.dtype == torch.float64 or not t.is_floating_point() else t.float()
         for name, t in unwrap(state_dict, source).items()
     }
-    model = _without_weights(config or ModelConfig(), image_size)
+    model = without_weights(config or ModelConfig(), image_size)
     fit(model, given, source, assign=True)
     return model.eval()
 
@@ -60,7 +60,7 @@ def load_published(path: str | Path) -> PlaceModel:
     return from_published(read_tensors(str(path)), str(path))
 
 
-def _without_weights(config: ModelConfig, image_size: int) -> PlaceModel:
+def without_weights(config: ModelConfig, image_size: int) -> PlaceModel:
     """The model with shapes but no memory, for tensors that are about to be assigned."""
     bare = dataclasses.replace(config, backbone=dataclasses.replace(config.backbone, weights=None))
     with torch.device("meta"):
@@ -155,7 +155,8 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
         with safe_open(file, framework="pt") as opened:
             metadata = opened.metadata() or {}
     except (SafetensorError, OSError) as error:
-        raise DataError(f"{file}: not a readable safetensors file ({error})") from error
+        hint = "" if file.suffix == ".safetensors" else "; jobs.weights makes one of released weights"
+        raise DataError(f"{file}: not a readable safetensors file ({error}){hint}") from error
     if metadata.get("format") != FORMAT:
         raise DataError(f"{file}: not a model written by this project (its metadata has no format '{FORMAT}')")
     return {
@@ -195,7 +196,7 @@ def load_model(path: str | Path, device: torch.device | str = "cpu") -> PlaceMod
     metadata = read_metadata(file)
     config: ModelConfig = metadata["config"]
     if metadata["everything"]:
-        model = _without_weights(config, metadata["image_size"])
+        model = without_weights(config, metadata["image_size"])
         fit(model, read_tensors(str(file)), str(file), assign=True)
     else:
         model = build_model(config, metadata["image_size"])

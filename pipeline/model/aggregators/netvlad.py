@@ -17,7 +17,7 @@ from pipeline.model.pooling import at_least_float32
 
 
 class NetVLAD(nn.Module):
-    """Tokens [b, 1 + N, D] -> K residual sums of unit length [b, K, D].
+    """Tokens [b, 1 + N, D] -> K residual sums of unit length [b, K, D], or their projection [b, 1, D'].
 
     Each is a region of its own: the cross-image encoder may follow. The centres should be set by `cluster` before
     training; without, they are random.
@@ -26,35 +26,49 @@ class NetVLAD(nn.Module):
     def __init__(self, config: NetVLADConfig, dim: int) -> None:
         super().__init__()
         self.config, self.regions, self.dim = config, config.clusters, dim
-        self.conv = nn.Conv2d(dim, config.clusters, 1, bias=False)
+        self.conv = nn.Conv2d(dim, config.clusters, 1, bias=config.bias)
         self.centroids = nn.Parameter(torch.rand(config.clusters, dim))
+        self.projection: nn.Linear | None = None
+        if config.projection:
+            self.projection = nn.Linear(config.clusters * dim, config.projection)
+            self.regions, self.dim = 1, config.projection
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """[b, 1 + N, D] -> [b, K, D]."""
+        """[b, 1 + N, D] -> [b, K, D], or [b, 1, D'] with a projection."""
         with torch.autocast(tokens.device.type, enabled=False):
             x = F.normalize(at_least_float32(tokens[:, 1:]), dim=-1)
             weight, centres = self.conv.weight.flatten(1).to(x.dtype), self.centroids.to(x.dtype)
-            assigned = F.linear(x, weight).softmax(dim=-1)  # [b, N, K]
+            bias = None if self.conv.bias is None else self.conv.bias.to(x.dtype)
+            assigned = F.linear(x, weight, bias).softmax(dim=-1)  # [b, N, K]
             # sum of a (x - c) over patches, without the [b, N, K, D] of residuals
             residuals = assigned.transpose(1, 2) @ x - assigned.sum(1).unsqueeze(-1) * centres
-            return F.normalize(residuals, dim=-1)
+            residuals = F.normalize(residuals, dim=-1)
+        if self.projection is None:
+            return residuals
+        projected: Tensor = self.projection(F.normalize(residuals.flatten(1), dim=-1))
+        return projected.unsqueeze(1)
 
     @torch.no_grad()
     def cluster(self, features: Tensor, seed: int, iterations: int = 50) -> None:
         """Sets centres and assignment from patch features [n, D] by k-means, as published.
 
         The assignment's sharpness alpha makes the nearest centre 100 times as likely as the second nearest, on
-        average over the features: alpha = -log(0.01) / mean(similarity of nearest - of second).
+        average over the features: alpha = -log(0.01) / mean(similarity of nearest - of second). With a bias the
+        similarity is minus the squared distance to the centre (the paper's Eq. 2 to 3), without it the cosine.
         """
         x = F.normalize(at_least_float32(features), dim=-1)
-        centres = k_means(x, self.regions, seed, iterations)
-        directions = F.normalize(centres, dim=-1)
+        centres = k_means(x, self.config.clusters, seed, iterations)
+        weight, bias = F.normalize(centres, dim=-1), torch.zeros_like(centres[:, 0])
+        if self.conv.bias is not None:  # -|x - c|^2 without |x|^2, which the softmax does not see
+            weight, bias = 2 * centres, -centres.square().sum(-1)
         alpha = 1.0
-        if self.regions > 1:
-            nearest = (x @ directions.T).topk(2, dim=-1).values
+        if self.config.clusters > 1:
+            nearest = F.linear(x, weight, bias).topk(2, dim=-1).values
             alpha = -math.log(0.01) / max(float((nearest[:, 0] - nearest[:, 1]).mean()), 1e-6)
         self.centroids.copy_(centres)
-        self.conv.weight.copy_((alpha * directions)[:, :, None, None])
+        self.conv.weight.copy_((alpha * weight)[:, :, None, None])
+        if self.conv.bias is not None:
+            self.conv.bias.copy_(alpha * bias)
 
 
 def k_means(points: Tensor, clusters: int, seed: int, iterations: int = 50) -> Tensor:
