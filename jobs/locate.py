@@ -3,9 +3,10 @@
     python -m jobs.locate --checkpoint outputs/RUN --build PHOTOS --index my-index
     python -m jobs.locate --checkpoint outputs/RUN --index my-index --photos A.jpg B.jpg
 
-PHOTOS is a folder (names may carry `@UTM_east@UTM_north@`) or a manifest: .csv or .parquet with `image` and, if known,
-`lat` and `lon` or `utm_east` and `utm_north`. Both at once build and then ask. Answers are printed and written to
-`<index>/answers/`: answers.json, and the photos beside their answers in answers.jpg.
+PHOTOS are folders (positions from names, `@UTM_east@UTM_north@`, or from EXIF GPS) or manifests: .csv or .parquet with
+`image` and, if known, `lat` and `lon` or `utm_east` and `utm_north`. Building again describes only what is new: the
+index then holds exactly the photos that PHOTOS hold now. Both at once build and then ask. Answers are printed and
+written to `<index>/answers/`: answers.json, and the photos beside their answers in answers.jpg.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ class LocateJob:
     """Folder of the index; belongs to the checkpoint that made it."""
     photos: tuple[str, ...] = ()
     """Photos to be located, or folders of them."""
-    build: str | None = None
-    """Folder of photos, or manifest, to make the index of."""
+    build: tuple[str, ...] = ()
+    """Folders of photos, or manifests, to make the index of; what it has of them already is not described again."""
     answers: int = 5
     """Places shown a photo."""
     output: str | None = None
@@ -47,8 +48,9 @@ class LocateJob:
     """Building: antialias as in training; published: normalise, then resize without."""
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
     """Building: autocast of the per-image part."""
-    batch: int = 32
-    """Building: images a forward pass."""
+    batch: int | None = None
+    """Building: images a forward pass; none: 1 on a CPU, which loses little there and makes an index the same to the
+    last bit however it has grown, and 32 on a GPU."""
     workers: int = 4
     """Building: decoding processes."""
     device: str = "auto"
@@ -59,7 +61,7 @@ class LocateJob:
 
 def main() -> None:
     """Parses, builds where asked to, answers where asked to."""
-    job = parse(LocateJob, __doc__ or "", photo_words(sys.argv[1:]))
+    job = parse(LocateJob, __doc__ or "", path_words(sys.argv[1:]))
     for name, example in (("checkpoint", "outputs/cricavpr"), ("index", "my-index")):
         if not getattr(job, name):
             raise UsageError(f"--{name} is missing: for example --{name} {example}")
@@ -67,17 +69,25 @@ def main() -> None:
         raise UsageError("nothing to do: give --photos to be located, or --build PHOTOS to make the index")
     if job.answers < 1:
         raise UsageError(f"--answers is {job.answers}; it must be at least 1")
+    if job.batch is not None and job.batch < 1:
+        raise UsageError(f"--batch is {job.batch}; it must be at least 1")
     run(job)
 
 
-def photo_words(argv: Sequence[str]) -> list[str]:
-    """`--photos A.jpg B.jpg` as one list for the parser, whatever characters the names hold."""
-    words = list(argv)
-    if "--photos" not in words:
-        return words
-    first = words.index("--photos") + 1
-    last = next((i for i in range(first, len(words)) if words[i].startswith("--")), len(words))
-    return [*words[:first], json.dumps(words[first:last]), *words[last:]]
+def path_words(argv: Sequence[str]) -> list[str]:
+    """`--photos A.jpg B.jpg` and `--build A B` as one list each for the parser, whatever characters the names hold."""
+    words: list[str] = []
+    paths: list[str] | None = None
+    for word in [*argv, "--"]:
+        if word.startswith("--"):
+            words += [] if paths is None else [json.dumps(paths)]
+            paths = [] if word in ("--photos", "--build") else None
+            words.append(word)
+        elif paths is None:
+            words.append(word)
+        else:
+            paths.append(word)
+    return words[:-1]
 
 
 def run(job: LocateJob) -> None:
@@ -86,7 +96,8 @@ def run(job: LocateJob) -> None:
 
     from pipeline.config import EvaluationConfig
     from pipeline.evaluation.evaluate import model_fingerprint
-    from pipeline.evaluation.locate import locate, make_index, open_index
+    from pipeline.evaluation.locate import locate
+    from pipeline.evaluation.photo_index import make_index, open_index
     from pipeline.model.weights import checkpoint_file, load_model, load_published
 
     photos = asked(job.photos)
@@ -95,12 +106,18 @@ def run(job: LocateJob) -> None:
     model = load_published(file).to(device) if file.suffix == ".pth" else load_model(file, device)
     fingerprint = model_fingerprint(model)
     if job.build:
+        batch = job.batch or (1 if torch.device(device).type == "cpu" else 32)
         config = EvaluationConfig(resize=job.resize, precision=job.precision, search=job.search, pca=job.pca,
-                                  batch=job.batch, workers=job.workers)  # fmt: skip
-        index = make_index(model, Path(job.build), folder, config, device, fingerprint, {"checkpoint": str(file)})
+                                  batch=batch, workers=job.workers)  # fmt: skip
+        sources, about = [Path(source) for source in job.build], {"checkpoint": str(file)}
+        index = make_index(model, sources, folder, config, device, fingerprint, about)
         where = {"none": "without positions", "utm": "with UTM positions", "degrees": "with latitude and longitude"}
-        print(f"{folder}: {len(index.photos):,} photos {where[index.coordinates]}, {index.index.d:,} numbers each, "
-              f"{job.search} search, {index.about['bytes'] / 1e6:,.1f} MB")  # fmt: skip
+        zone = f", zone {index.zone}" if index.zone else ""
+        for remark in index.about["remarks"]:
+            print(remark)
+        print(index.growth)
+        size = f"{index.index.d:,} numbers each, {job.search} search, {index.about['bytes'] / 1e6:,.1f} MB"
+        print(f"{folder}: {len(index.photos):,} photos {where[index.coordinates]}{zone}, {size}")
     else:
         index = open_index(folder, fingerprint)
     if photos:
@@ -122,7 +139,8 @@ def asked(given: Sequence[str]) -> list[Path]:
 def tell(job: LocateJob, index: object, answers: Sequence[object]) -> None:
     """Prints the answers and writes them down."""
     from pipeline.evaluation import figures
-    from pipeline.evaluation.locate import Answer, PhotoIndex, place_text
+    from pipeline.evaluation.locate import Answer, place_text
+    from pipeline.evaluation.photo_index import PhotoIndex
 
     assert isinstance(index, PhotoIndex)
     root = index.about["root"]
@@ -130,15 +148,17 @@ def tell(job: LocateJob, index: object, answers: Sequence[object]) -> None:
     rows, pictured = [], []
     for answer in answers:
         assert isinstance(answer, Answer)
-        print(answer.photo)
+        gps = place_text(answer.own, "degrees") or (f"broken GPS: {answer.problem}" if answer.problem else "")
+        print(f"{answer.photo}  {gps}".rstrip())
         notes = []
-        for rank, (place, far, position) in enumerate(
-            zip(answer.places, answer.distances, answer.positions, strict=True), 1
-        ):
-            where = place_text(position, index.coordinates)
+        for rank, (place, far) in enumerate(zip(answer.places, answer.distances, strict=True), 1):
+            where = place_text(answer.positions[rank - 1], index.coordinates)
+            degrees, metres = place_text(answer.degrees[rank - 1], "degrees"), answer.metres[rank - 1]
+            away = "" if metres is None else f"{metres:,.0f} m away"
             shown = place.relative_to(root) if place.is_relative_to(root) else place
-            print(f"  {rank:>2}  distance {far:.3f}  {shown}  {where}".rstrip())
-            notes.append((place, f"distance {far:.3f}\n{where}"))
+            told = "  ".join(filter(None, (where, degrees and f"({degrees})", away)))
+            print(f"  {rank:>2}  distance {far:.3f}  {shown}  {told}".rstrip())
+            notes.append((place, f"distance {far:.3f}\n{where or away}"))
         rows.append(answer.to_dict(index.coordinates))
         pictured.append((answer.photo, notes))
     output = Path(job.output) if job.output else index.folder / "answers"

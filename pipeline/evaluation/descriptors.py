@@ -172,6 +172,35 @@ def describe_alone(model: nn.Module, photo: Path, resize: Any, precision: Any, d
     return described
 
 
+def describe_each(
+    model: nn.Module,
+    paths: Sequence[Path],
+    config: EvaluationConfig,
+    device: torch.device,
+    label: str = "describing",
+    progress: bool = True,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(positions [n], descriptors [n, dim]) of images, each a group of its own, a forward batch at a time.
+
+    For a model in `evaluating`, on one process; nothing is kept. With `config.batch` 1 each is what `describe_alone`
+    gives, to the last bit. Raises `DataError` naming a broken image, after what came before it was given.
+    """
+    size, together = int(model.image_size), getattr(model, "correlates_alone", False)  # type: ignore[arg-type]
+    batches = [np.arange(s, min(s + config.batch, len(paths))) for s in range(0, len(paths), config.batch)]
+    loader = _loader(_Batches(paths, batches, size, config.resize), config.workers)
+    with Progress(label, len(paths), "images", enabled=progress) as bar:
+        for batch, (images, problem) in zip(batches, loader, strict=True):
+            if problem:
+                raise DataError(problem)
+            regions = _forward(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
+            if together and len(batch) > 1:
+                described = model.correlate(regions, alone=True)  # type: ignore[operator]
+            else:
+                described = torch.cat([model.correlate(one[None]) for one in regions])  # type: ignore[operator]
+            yield batch, described.float().cpu().numpy()
+            bar.advance(len(batch))
+
+
 def correlate(
     model: nn.Module,
     regions: Regions,

@@ -16,13 +16,15 @@ import numpy as np
 from shards.errors import DataError, UsageError
 
 ROWS = 65_536  # database rows searched at once: their norms and faiss's temporaries, not the result, depend on it
+SLICE_BYTES = 2**28  # and the bytes of an array that are taken at once
 QUERIES = 4_096  # queries searched at once
 Blocks = Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]
 """Gives the blocks (row numbers [n], descriptors [n, dim]) of a store or array afresh at each call."""
 
 
 def slices(array: np.ndarray, rows: int = ROWS) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The blocks (row numbers [n], descriptors [n, dim]) of an array or memory map."""
+    """The blocks (row numbers [n], descriptors [n, dim]) of an array or memory map, at most `SLICE_BYTES` each."""
+    rows = max(1, min(rows, SLICE_BYTES // max(1, array[:1].nbytes)))
     for first in range(0, len(array), rows):
         yield np.arange(first, min(first + rows, len(array))), array[first : first + rows]
 
@@ -121,10 +123,17 @@ def agreement(approximate: np.ndarray, exact: np.ndarray) -> float:
 
 
 def index_bytes(index: Any) -> int:
-    """Size of the index when saved, and about its size in memory."""
+    """Size of the index when saved, and about its size in memory, counted without a copy of it."""
     import faiss
 
-    return int(faiss.serialize_index(index).nbytes)
+    total = 0
+
+    def count(piece: bytes) -> None:
+        nonlocal total
+        total += len(piece)
+
+    faiss.write_index(index, faiss.PyCallbackIOWriter(count))  # type: ignore[attr-defined]
+    return total
 
 
 def save_index(index: Any, path: Path) -> None:

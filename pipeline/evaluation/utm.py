@@ -17,6 +17,7 @@ from shards.errors import DataError
 AXIS = 6378137.0
 FLATTENING = 1 / 298.257223563
 SCALE = 0.9996
+WIDEST = 20.0  # degrees of longitude from the middle of a zone
 _N = FLATTENING / (2 - FLATTENING)
 # coefficients of n, n^2, ... n^6 for the harmonics 1 ... 6 (Karney 2011, Eq. 35)
 _ALPHA = (
@@ -63,6 +64,20 @@ def file_positions(paths: Iterable[Path]) -> np.ndarray | None:
     return np.array(known, np.float64).reshape(-1, 2)
 
 
+def file_zone(path: Path) -> str:
+    """The zone of an `@` file name as its number and hemisphere, "31N" or "31S"; "" where fields 3 and 4 do not tell.
+
+    Field 4 is a latitude band: C to M lie south of the equator, N to X north of it.
+    """
+    fields = path.name.split("@")
+    if len(fields) < 5 or not fields[3].isdigit() or not 1 <= int(fields[3]) <= 60:
+        return ""
+    band = fields[4].upper()
+    if len(band) != 1 or band not in "CDEFGHJKLMNPQRSTUVWX":
+        return ""
+    return f"{int(fields[3])}{'S' if band < 'N' else 'N'}"
+
+
 def utm_zone(latitude: float, longitude: float) -> int:
     """The UTM zone 1 ... 60 of a point in degrees, with the exceptions for Norway and Svalbard."""
     longitude = (longitude + 180.0) % 360.0 - 180.0
@@ -73,13 +88,21 @@ def utm_zone(latitude: float, longitude: float) -> int:
     return int((longitude + 180.0) // 6.0) + 1
 
 
-def to_utm(latitude: np.ndarray, longitude: np.ndarray, zone: int | None = None) -> np.ndarray:
+def meridian_offset(longitude: np.ndarray, zone: int) -> np.ndarray:
+    """Degrees east of the central meridian of a UTM zone, -180 ... 180, float64 [n]."""
+    offset: np.ndarray = (np.asarray(longitude, np.float64) - (6 * zone - 183) + 180.0) % 360.0 - 180.0
+    return offset
+
+
+def to_utm(
+    latitude: np.ndarray, longitude: np.ndarray, zone: int | None = None, south: bool | None = None
+) -> np.ndarray:
     """UTM east and north in metres, float64 [n, 2], of WGS84 degrees [n] and [n].
 
     All points go into one zone, `zone` or else that of the middle point, so that distances across a zone border stay
-    distances. Southern points get the usual 10,000 km added when the middle point is southern; so a set across the
-    equator also stays in one piece. Raises `DataError` for values that are no coordinates, and when points lie more
-    than 20 degrees from the zone's central meridian.
+    distances. All points get the usual 10,000 km added when `south`, or else when the middle point is southern; so a
+    set across the equator also stays in one piece. Raises `DataError` for values that are no coordinates, and when
+    points lie more than 20 degrees from the zone's central meridian.
     """
     latitude, longitude = np.asarray(latitude, np.float64).ravel(), np.asarray(longitude, np.float64).ravel()
     good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360)
@@ -92,8 +115,8 @@ def to_utm(latitude: np.ndarray, longitude: np.ndarray, zone: int | None = None)
         return np.zeros((0, 2))
     if zone is None:
         zone = utm_zone(float(np.median(latitude)), float(np.median(longitude)))
-    offset = (longitude - (6 * zone - 183) + 180.0) % 360.0 - 180.0
-    if np.abs(offset).max() > 20:
+    offset = meridian_offset(longitude, zone)
+    if np.abs(offset).max() > WIDEST:
         at = int(np.argmax(np.abs(offset)))
         raise DataError(
             f"row {at + 1}: longitude {longitude[at]} is {abs(offset[at]):.0f} degrees from the middle of UTM zone "
@@ -113,5 +136,18 @@ def to_utm(latitude: np.ndarray, longitude: np.ndarray, zone: int | None = None)
         north += alpha * np.sin(2 * harmonic * xi) * np.cosh(2 * harmonic * eta)
         east += alpha * np.cos(2 * harmonic * xi) * np.sinh(2 * harmonic * eta)
     radius = AXIS / (1 + _N) * (1 + _N**2 / 4 + _N**4 / 64 + _N**6 / 256)
-    false_north = 10_000_000.0 if np.median(latitude) < 0 else 0.0
+    south = bool(np.median(latitude) < 0) if south is None else south
+    false_north = 10_000_000.0 if south else 0.0
     return np.stack([500_000.0 + SCALE * radius * east, false_north + SCALE * radius * north], axis=1)
+
+
+def metres_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Great-circle distance in metres [n] between WGS84 (latitude, longitude) [n, 2] and [n, 2] (or [2]).
+
+    On the sphere of the mean radius (haversine): within 0.6 % of the ellipsoid's distance, anywhere on Earth.
+    """
+    a, b = np.radians(np.asarray(first, np.float64)), np.radians(np.asarray(second, np.float64))
+    half = np.sin((b - a) / 2) ** 2
+    chord = half[..., 0] + np.cos(a[..., 0]) * np.cos(b[..., 0]) * half[..., 1]
+    distance: np.ndarray = 2 * 6371008.8 * np.arcsin(np.sqrt(np.clip(chord, 0, 1)))
+    return distance

@@ -11,38 +11,19 @@ import torch
 from job_process import JobProcess
 from PIL import Image
 from tiny import photo
+from tiny_checkpoint import save_tiny
 
-from jobs.locate import photo_words
-from pipeline.config import (
-    AdapterConfig,
-    BackboneConfig,
-    CrossImageConfig,
-    EvaluationConfig,
-    ModelConfig,
-    PoolingConfig,
-)
+from jobs.locate import path_words
+from pipeline.config import EvaluationConfig
 from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.evaluate import model_fingerprint
-from pipeline.evaluation.locate import locate, make_index, open_index
-from pipeline.model.vpr import PlaceModel, build_model
-from pipeline.model.weights import load_model, save_model
+from pipeline.evaluation.locate import locate
+from pipeline.evaluation.photo_index import make_index, open_index
+from pipeline.model.vpr import PlaceModel
+from pipeline.model.weights import load_model
 from shards.errors import DataError, UsageError
 
 CONFIG = EvaluationConfig(workers=0, batch=4)
-
-
-def save_tiny(folder: Path, seed: int) -> Path:
-    config = ModelConfig(
-        backbone=BackboneConfig(name="custom", dim=16, depth=1, heads=2, patch=7, pretrain_grid=4),
-        adapter=AdapterConfig(reduced=2),
-        pooling=PoolingConfig(levels=(1, 2)),
-        cross_image=CrossImageConfig(layers=1, heads=2, feedforward=16),
-    )
-    torch.manual_seed(seed)
-    path = folder / "checkpoints" / "best" / "model.safetensors"
-    path.parent.mkdir(parents=True)
-    save_model(build_model(config, 28), path, config, 28, everything=True)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -158,5 +139,5 @@ def test_a_broken_photo_of_the_folder_is_named_and_nothing_is_left(
 
 
 def test_names_of_photos_may_hold_anything() -> None:
-    words = photo_words(["--index", "i", "--photos", "a, b.jpg", "[c].jpg", "--answers", "2"])
-    assert words == ["--index", "i", "--photos", '["a, b.jpg", "[c].jpg"]', "--answers", "2"]
+    words = path_words(["--index", "i", "--photos", "a, b.jpg", "[c].jpg", "--answers", "2", "--build", "A", "B"])
+    assert words == ["--index", "i", "--photos", '["a, b.jpg", "[c].jpg"]', "--answers", "2", "--build", '["A", "B"]']
