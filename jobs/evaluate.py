@@ -52,6 +52,7 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     from pipeline.evaluation import report, tables
     from pipeline.evaluation.datasets import available, load_set
     from pipeline.evaluation.evaluate import evaluate, fit_projections, model_fingerprint
+    from pipeline.evaluation.msls import export_predictions
     from pipeline.evaluation.predictions import save_predictions
     from pipeline.model.weights import checkpoint_file, load_model, load_published, read_metadata
 
@@ -86,9 +87,12 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     tables.write_csv(results, output / "results.csv")
     (output / "results.md").write_text(tables.markdown(results))
     for result in results:
-        save_predictions(result, next(s for s in sets if s.name == result.set_name), output / "predictions")
+        evaluated = next(s for s in sets if s.name == result.set_name)
+        kept = save_predictions(result, evaluated, output / "predictions")
+        if evaluated.name == "msls_challenge":  # the benchmark takes a file
+            export_predictions(evaluated, result.predictions, kept.with_suffix(".txt"))
     if job.figures:
-        pictures = report.draw(results, sets, output / "figures")
+        pictures = report.draw(results, sets, output / "figures", model)
         facts = {key: str(value) for key, value in about.items()}
         title = f"Evaluation of {(runs[0] if runs else file).name}"
         report.write_report(results, pictures, output / "report.html", title, facts)

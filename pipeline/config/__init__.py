@@ -109,7 +109,9 @@ class EvaluationConfig:
     """Exact L2 search, or a faiss approximation for large sets, whose recall against exact is measured and printed."""
     rerank: int = 0
     """Second stage: this many first candidates are put in order by matching patch tokens in space; 0: none. Reads the
-    candidates' images again; for evaluation of whole models, not under ZeRO-3."""
+    candidates' images again; not for validation during training."""
+    rerank_layer: int | None = None
+    """Block (transformer) or stage (ResNet, VGG) of the backbone whose patches are matched, from 1; none: its last."""
 
 
 @dataclass(frozen=True)

@@ -120,6 +120,8 @@ class CrossImageConfig:
     """Width of the feed-forward part (published: 2048)."""
     dropout: float = 0.1
     """Dropout in attention, feed-forward and residuals (published: 0.1)."""
+    alone: bool = False
+    """Each image attends to itself only, in training too: the layers without the crossing, a control (ours)."""
 
 
 @dataclass(frozen=True)

@@ -151,7 +151,7 @@ def encode(
         for step in range(first, steps):
             dealt = batches[step * w : (step + 1) * w]
             images, problem = next(loader) if r < len(dealt) else (torch.zeros(1, 3, size, size), "")
-            _raise_together(problem, device)
+            raise_together(problem, device)
             encoded = _forward(model.encode, images, config, device, dtype)  # type: ignore[arg-type]
             gathered = distributed.gather_uneven(encoded if r < len(dealt) else encoded[:0])
             regions.put(np.concatenate(dealt), gathered.cpu().numpy())
@@ -281,7 +281,7 @@ def _loader(dataset: _Batches, workers: int) -> torch.utils.data.DataLoader[tupl
     )
 
 
-def _raise_together(problem: str, device: torch.device) -> None:
+def raise_together(problem: str, device: torch.device) -> None:
     """Raises the same DataError on every rank as soon as one has a problem, so that none waits for ever."""
     if not distributed.any_rank(bool(problem), device):
         return

@@ -63,11 +63,6 @@ class EvaluationSet:
         """How many queries have no correct database image at all."""
         return sum(len(p) == 0 for p in self.positives)
 
-    @property
-    def queries_without_positives(self) -> list[Path]:
-        """Which queries those are."""
-        return [query for query, p in zip(self.queries, self.positives, strict=True) if len(p) == 0]
-
 
 def list_images(folder: Path, natural: bool = False) -> list[Path]:
     """All images below `folder` (jpg, jpeg, png in any case), sorted by path as the field does.

@@ -50,6 +50,8 @@ class Protocol:
     """exact L2, or the approximate index used."""
     rerank: int = 0
     """Candidates put in order anew by matching patches in space (a second stage); 0: none, one stage."""
+    rerank_layer: int | None = None
+    """Block or stage of the backbone whose patches were matched; None: its last."""
 
     @property
     def name(self) -> str:
@@ -65,7 +67,7 @@ class Protocol:
             parts.append("drop")
         parts += [value for value in (self.precision, self.search) if value not in ("fp32", "exact")]
         if self.rerank:
-            parts.append(f"rerank{self.rerank}")
+            parts.append(f"rerank{self.rerank}" + (f"l{self.rerank_layer}" if self.rerank_layer else ""))
         if self.stored != "fp32":
             parts.append(f"{self.stored}store")
         return "_".join(parts)
@@ -74,7 +76,15 @@ class Protocol:
     def grouping(self) -> Protocol:
         """The same protocol without what happens after the descriptors: PCA, positives, search."""
         return dataclasses.replace(
-            self, pca=None, whiten=False, pca_source=None, rule="", without_positives="", search="exact", rerank=0
+            self,
+            pca=None,
+            whiten=False,
+            pca_source=None,
+            rule="",
+            without_positives="",
+            search="exact",
+            rerank=0,
+            rerank_layer=None,
         )
 
     def describe(self) -> str:
@@ -91,7 +101,8 @@ class Protocol:
                 f"PCA {self.pca}{' whitened' if self.whiten else ''} fitted on {self.pca_source or 'its own database'}"
             )
         missing = "a miss" if self.without_positives == "miss" else "dropped"
-        second = f", first {self.rerank} re-ranked by matching patches in space" if self.rerank else ""
+        layer = f" of layer {self.rerank_layer}" if self.rerank_layer else ""
+        second = f", first {self.rerank} re-ranked by matching patches{layer} in space" if self.rerank else ""
         kept = self.precision if self.stored == self.precision else f"{self.precision}, stored {self.stored}"
         return (
             f"{groups}; {self.image_size} px {interpolation}; {pca}; {kept}; {self.search} L2 search{second}; "
@@ -134,6 +145,7 @@ def protocols(config: EvaluationConfig, image_size: int, rule: str) -> list[Prot
             stored="fp16" if config.store == "fp16" else "fp32",
             search=config.search,
             rerank=config.rerank,
+            rerank_layer=config.rerank_layer if config.rerank else None,
         )
         for groups in dict.fromkeys(config.groups)
     ]

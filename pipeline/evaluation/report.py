@@ -10,6 +10,9 @@ import html
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from pipeline.evaluation import figures
 from pipeline.evaluation.error_plots import error_plot
@@ -48,6 +51,7 @@ GRIDS: tuple[tuple[figures.Kind, str], ...] = (
     ("failures", "First answer wrong"),
     ("worst", "Worst errors: no right answer at all"),
 )
+SOME = 6  # queries, spread over the set, of which answers or attention are shown
 
 
 @dataclass(frozen=True)
@@ -61,9 +65,12 @@ class Picture:
     """Whether the report shows it unfolded."""
 
 
-def draw(results: Sequence[Result], sets: Sequence[EvaluationSet], folder: Path) -> list[Picture]:
-    """Draws everything the report shows, into `folder`: for each set the curves of its protocols, and for each
-    protocol grids and an error plot. Sets without ground truth get a grid of answers alone."""
+def draw(
+    results: Sequence[Result], sets: Sequence[EvaluationSet], folder: Path, model: Any | None = None
+) -> list[Picture]:
+    """Draws everything the report shows, into `folder`: for each set the curves of its protocols, for each protocol
+    grids and an error plot, and with a `model` what it attends to in some queries. Sets without ground truth get a
+    grid of answers alone."""
     drawn: list[Picture] = []
     for evaluated in sets:
         own = [result for result in results if result.set_name == evaluated.name]
@@ -86,7 +93,34 @@ def draw(results: Sequence[Result], sets: Sequence[EvaluationSet], folder: Path)
                     path = folder / f"{name}.{protocol}.{kind}.jpg"
                     figures.retrieval_grid(evaluated, result, chosen, path, title)
                     drawn.append(Picture(name, f"{protocol}: {title.lower()}", path, number == 0))
+        some = np.linspace(0, len(evaluated.queries) - 1, min(SOME, len(evaluated.queries))).round().astype(int)
+        for result in own if not scored else ():
+            protocol, path = result.protocol.name, folder / f"{name}.{result.protocol.name}.answers.jpg"
+            figures.answer_grid(_answers(evaluated, result, some), path, "Answers", figures.caption(result))
+            drawn.append(Picture(name, f"{protocol}: answers, which are right is not known", path))
+        if model is not None:
+            path = folder / f"{name}.attention.jpg"
+            queries = [evaluated.queries[i] for i in some]
+            figures.attention_overlay(model, queries, path, "Channel mean of the patch tokens")
+            drawn.append(Picture(name, "attention: what the patch tokens of some queries weigh", path))
     return drawn
+
+
+def _answers(
+    evaluated: EvaluationSet, result: Result, queries: np.ndarray
+) -> list[tuple[Path, list[tuple[Path, str]]]]:
+    """Queries with their first answers and L2 distances, as `answer_grid` draws them."""
+    return [
+        (
+            evaluated.queries[q],
+            [
+                (evaluated.database[row], f"{distance**0.5:.3f}")
+                for row, distance in zip(result.predictions[q, :5], result.distances[q, :5], strict=True)
+                if row >= 0
+            ],
+        )
+        for q in queries
+    ]
 
 
 def write_report(

@@ -2,7 +2,7 @@
 
 Invariant: only the order of the first `rerank` candidates changes, never which they are; a candidate's score depends on
 the two images and their row numbers alone, and ties keep the order of the global search. Patch tokens come from the
-backbone of the model that made the descriptors, one image at a time, so no grouping enters.
+backbone of the model that made the descriptors, one image at a time: no grouping and no number of processes enters.
 
 The check: patches of query and candidate that are each other's nearest (cosine) are matches; a similarity transform
 (scale, rotation, shift) between the two patch grids is proposed by pairs of matches; the score is the largest number of
@@ -21,16 +21,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from pipeline import distributed
 from pipeline.config import EvaluationConfig
 from pipeline.data.images import load_image, normalise, to_input
+from pipeline.evaluation.descriptors import raise_together
 from pipeline.evaluation.evaluation_set import EvaluationSet
-from shards.errors import UsageError
+from shards.errors import DataError, UsageError
 from shards.progress import Progress
 
 PROPOSALS = 256  # pairs of matches tried; all pairs where there are fewer
 TOLERANCE = 1.5  # patches: half a patch each of two roundings to the grid, and one of distortion
 SCALES = (0.5, 2.0)  # enlargement between two photographs of a place
 TURN = np.pi / 6  # cameras are held upright
+SIDE = 4  # patches: a smaller grid tells too little
 CACHE_BYTES = 2**30  # patch tokens kept: neighbours of one query are often candidates of the next
 
 
@@ -87,7 +90,7 @@ class PatchTokens:
             image = to_input(load_image(path), self.model.image_size, self.config.resize).to(self.device)
             image = normalise(image) if image.dtype == torch.uint8 else image
             with torch.no_grad():
-                tokens = self.model.backbone(image[None])[0, 1:]
+                tokens = self.model.backbone.patches(image[None], self.config.rerank_layer)[0]
             self._kept[path] = F.normalize(tokens.float(), dim=-1).half()
             size = self._kept[path].numel() * 2
             while len(self._kept) * size > CACHE_BYTES and len(self._kept) > 1:
@@ -103,6 +106,19 @@ def score(query: Tensor, candidate: Tensor, seed: tuple[int, int]) -> int:
     return inliers(left % grid + 1j * (left // grid), right % grid + 1j * (right // grid), seed)
 
 
+def check(model: Any, config: EvaluationConfig, device: torch.device | str) -> None:
+    """Whether the model's patches can be matched as `config` asks, by one blank image: before hours of describing.
+
+    Raises:
+        UsageError: no such layer, or fewer than 4 x 4 patches; the same on all ranks.
+    """
+    blank = torch.zeros(1, 3, model.image_size, model.image_size, device=device)
+    with torch.no_grad():
+        patches = model.backbone.patches(blank, config.rerank_layer).shape[1]
+    if patches < SIDE * SIDE:
+        raise UsageError(f"rerank: {patches} patches an image are too few to check in space, at least 16 are needed")
+
+
 def rerank(
     model: Any,
     evaluated: EvaluationSet,
@@ -112,29 +128,38 @@ def rerank(
     distances: np.ndarray,
     progress: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The first `config.rerank` of each query's candidates in the order of their scores; on one process.
+    """The first `config.rerank` of each query's candidates in the order of their scores. Collective.
+
+    Each rank takes consecutive queries, whose candidates overlap; every rank needs the whole model.
 
     Args:
         model: a `PlaceModel` in evaluation mode.
         predictions, distances: [Q, k] database rows (-1: none) and squared distances of the global search.
 
     Raises:
-        UsageError: fewer candidates than are to be re-ranked; DataError: an image that cannot be read.
+        UsageError: fewer candidates than are to be re-ranked; DataError: an image that cannot be read, on all ranks.
     """
     if predictions.shape[1] < config.rerank:
         raise UsageError(f"rerank {config.rerank} needs as many candidates, the search gave {predictions.shape[1]}")
-    if model.backbone.grid < 4:
-        raise UsageError(f"rerank: {model.backbone.grid} x {model.backbone.grid} patches are too few to check in space")
     tokens = PatchTokens(model, config, device)
-    rows, ordered = predictions.copy(), distances.copy()
-    with Progress(f"re-ranking {evaluated.name}", len(rows), "queries", enabled=progress) as bar:
-        for q, candidates in enumerate(predictions[:, : config.rerank]):
-            query = tokens.of(evaluated.queries[q])
-            scores = [
-                score(query, tokens.of(evaluated.database[row]), (q, int(row))) if row >= 0 else -1
-                for row in candidates
-            ]
-            order = np.argsort(-np.array(scores), kind="stable")
-            rows[q, : config.rerank], ordered[q, : config.rerank] = candidates[order], distances[q, order]
-            bar.advance()
-    return rows, ordered
+    own = distributed.rank_slice(len(predictions))
+    scores = np.full((own.stop - own.start, config.rerank), -1, np.int64)
+    problem = ""
+    label, show = f"re-ranking {evaluated.name}", progress and distributed.rank() == 0
+    with Progress(label, len(scores), "queries of this rank", enabled=show) as bar:
+        try:
+            for i, q in enumerate(range(own.start, own.stop)):
+                query = tokens.of(evaluated.queries[q])
+                for j, row in enumerate(predictions[q, : config.rerank].tolist()):
+                    if row >= 0:
+                        scores[i, j] = score(query, tokens.of(evaluated.database[row]), (q, row))
+                bar.advance()
+        except (DataError, OSError) as error:
+            problem = str(error)
+    raise_together(problem, torch.device(device))
+    all_scores = distributed.gather_uneven(torch.from_numpy(scores).to(device)).cpu().numpy()
+    order = np.argsort(-all_scores, axis=1, kind="stable")
+    rows, kept = predictions.copy(), distances.copy()
+    rows[:, : config.rerank] = np.take_along_axis(predictions[:, : config.rerank], order, 1)
+    kept[:, : config.rerank] = np.take_along_axis(distances[:, : config.rerank], order, 1)
+    return rows, kept

@@ -17,7 +17,7 @@ from typing import Any
 from pipeline.config import EvaluationConfig, ModelConfig, RunConfig, flatten, to_dict
 from pipeline.evaluation import paper
 from pipeline.evaluation.protocol import Protocol, protocols
-from pipeline.experiments.rows import DIMENSIONS, EPOCHS, PLACES, Row
+from pipeline.experiments.rows import DEPTH, DIMENSIONS, EPOCHS, PLACES, Row
 from pipeline.model.variants import VARIANTS, variant
 from shards.errors import UsageError
 
@@ -118,6 +118,11 @@ def dimensions(of_model: int, row: int) -> int:
     return max(1, round(of_model * row / DIMENSIONS))
 
 
+def last_blocks(depth: int, row: int) -> int:
+    """The variant's `row` trained blocks of the paper's 12, in proportion to a transformer of `depth` blocks."""
+    return max(1, round(depth * row / DEPTH))
+
+
 def evaluation(
     row: Row, base: EvaluationConfig, set_name: str, published: str, descriptor_dim: int
 ) -> EvaluationConfig:
@@ -153,6 +158,9 @@ def own_settings(row: Row, found: Training, base: RunConfig, config: EvaluationC
     told = []
     if row.places is not None and found.config.data.places_per_batch != row.places:
         told.append(f"{found.config.data.places_per_batch} places")
+    model = found.config.model
+    if model.last_blocks != variant(row.variant, base.model).last_blocks:
+        told.append(f"last {model.last_blocks} of {model.backbone.depth} blocks trained")
     if row.epochs is not None and base.train.epochs != EPOCHS and found.steps is not None:
         told.append(f"{found.steps:,} steps")
     if row.pca is not None and config is not None and config.pca != row.pca:
@@ -177,6 +185,8 @@ def _model(row: Row, base: ModelConfig, resnet_weights: str | None) -> ModelConf
         model = dataclasses.replace(
             model, backbone=dataclasses.replace(model.backbone, name=name, weights=resnet_weights)
         )
+    elif model.backbone.name == "custom" and model.train == "last" and base.train != "last":
+        model = dataclasses.replace(model, last_blocks=last_blocks(model.backbone.depth, model.last_blocks))
     return model
 
 

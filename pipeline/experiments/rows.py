@@ -13,8 +13,8 @@ from typing import Any
 
 from shards.errors import UsageError
 
-PLACES, EPOCHS, DIMENSIONS = 72, 10, 10752
-"""The paper's batch, length of training and descriptor, to which a row's figures are in proportion."""
+PLACES, EPOCHS, DIMENSIONS, DEPTH = 72, 10, 10752, 12
+"""The paper's batch, length of training, descriptor and backbone, to which a row's figures are in proportion."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +148,9 @@ TABLES: dict[str, Table] = {
                 changes={"model.adapter.init": "published"}, paper=("ablation_crica", "AdaptSPM+Crica")
             ),
             "VanillaAdapter": Row(variant="VanillaAdapter", paper=("ablation_adaptation", "VanillaAdapter")),
+            "encoder, each image alone": Row(
+                changes={"model.adapter.init": "kaiming", "model.cross_image.alone": True},
+            ),
             "no cross-image encoder": Row(
                 variant="AdaptSPM", changes={"model.adapter.init": "kaiming"}, paper=("ablation_crica", "AdaptSPM")
             ),

@@ -200,6 +200,33 @@ class Backbone(nn.Module):
         """The adapters in block order; empty without adapters."""
         return [block.mlp.adapter for block in self.blocks if isinstance(block.mlp, AdaptedMLP)]
 
+    def patches(self, images: Tensor, layer: int | None = None) -> Tensor:
+        """[b, 3, S, S] -> [b, G*G, D] patch tokens after block `layer` (1 is the first), under the final norm.
+
+        Args:
+            layer: None takes the last, which is `forward` without its class token.
+
+        Raises:
+            UsageError: no such block.
+        """
+        if layer is None:
+            return self(images)[:, 1:]
+        if not 1 <= layer <= self.depth:
+            raise UsageError(f"layer {layer}: the backbone's blocks are 1 to {self.depth}")
+        found: list[Tensor] = []
+
+        def keep(_: nn.Module, __: Any, output: Any) -> None:
+            found.append(output if isinstance(output, Tensor) else output[0])
+
+        hook = self.blocks[layer - 1].register_forward_hook(keep)
+        try:
+            self.vit(pixel_values=images)
+        finally:
+            hook.remove()
+        norm = self.vit.norm if self.rope else self.vit.layernorm
+        tokens: Tensor = norm(found[0])
+        return tokens[:, 1 + self.registers :]
+
     def forward(self, images: Tensor) -> Tensor:
         """[b, 3, S, S] -> [b, 1 + G*G, D]: class token first, then patches row by row."""
         tokens: Tensor = self.vit(pixel_values=images).last_hidden_state

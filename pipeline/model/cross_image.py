@@ -86,10 +86,11 @@ class CrossImageEncoder(nn.Module):
         super().__init__()
         if config.layers and dim % config.heads:
             raise UsageError(f"cross_image.heads {config.heads} does not divide the token width {dim}")
+        self.alone = config.alone
         self.layers = nn.ModuleList(CrossImageLayer(dim, config) for _ in range(config.layers))
 
     def forward(self, regions: Tensor, alone: bool = False) -> Tensor:
-        """[b, R, D] -> [b, R, D]; `alone`: of b groups of one image each, not of one group."""
+        """[b, R, D] -> [b, R, D]; `alone`: of b groups of one image each, not of one group (the config's, too)."""
         for layer in self.layers:
-            regions = layer(regions, alone)
+            regions = layer(regions, alone or self.alone)
         return regions

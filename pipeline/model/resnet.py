@@ -189,16 +189,29 @@ class ResNet(nn.Module):
         """None: the counterpart of the transformers' adapters."""
         return []
 
-    def map(self, images: Tensor, recompute: bool = False) -> Tensor:
-        """[b, 3, H, W] normalised images -> [b, D, h, w]; `recompute`: keep bottlenecks' inputs alone."""
+    def map(self, images: Tensor, recompute: bool = False, stage: int | None = None) -> Tensor:
+        """[b, 3, H, W] normalised images -> [b, D, h, w] after the last stage used, or after an earlier one.
+
+        `recompute`: keep bottlenecks' inputs alone.
+        """
         x = images
         if self.layout == "keras":
             x = (x * self.deviation.to(x.dtype) + self.mean.to(x.dtype)).flip(1) * 255 - self.keras_means.to(x.dtype)
         x = F.max_pool2d(F.relu(self.bn1(self.conv1(x))), 3, 2, padding=1)
-        for stage in self.blocks:
-            for block in stage:
+        for blocks in self.blocks[:stage]:
+            for block in blocks:
                 x = checkpoint(block, x, use_reentrant=False) if recompute and torch.is_grad_enabled() else block(x)
         return x
+
+    def patches(self, images: Tensor, layer: int | None = None) -> Tensor:
+        """[b, 3, H, W] -> [b, h*w, D] after stage `layer` (1 is the first); None: the last one used.
+
+        Raises:
+            UsageError: no such stage.
+        """
+        if layer is not None and not 1 <= layer <= self.depth:
+            raise UsageError(f"layer {layer}: the stages used of the backbone are 1 to {self.depth}")
+        return self.map(images, stage=layer).flatten(2).transpose(1, 2)
 
     def forward(self, images: Tensor, recompute: bool = False) -> Tensor:
         """[b, 3, H, W] -> [b, 1 + h*w, D]."""

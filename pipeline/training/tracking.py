@@ -111,13 +111,6 @@ class Tracker:
             entries = [Metric(name, float(value), now, step) for name, value in values.items()]
             self._client.log_batch(self.run_id, metrics=entries, synchronous=False)
 
-    def artifact(self, path: Path, folder: str | None = None) -> None:
-        """Stores a file, or a folder's files, with the run."""
-        if self._client is None:
-            return
-        with self._recording(f"artifact {path}"):
-            (self._client.log_artifacts if path.is_dir() else self._client.log_artifact)(self.run_id, str(path), folder)
-
     def checkpoint(self, path: Path, step: int, values: dict[str, float]) -> None:
         """Registers a checkpoint folder as a logged model of the run, ranked by its validation figures."""
         if self._client is None:

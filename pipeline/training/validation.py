@@ -31,6 +31,10 @@ class Validation:
     def __init__(self, config: RunConfig, device: Any) -> None:
         from pipeline.evaluation.datasets import load_set
 
+        if config.validate.rerank:
+            raise UsageError(
+                "validate.rerank: a checkpoint is chosen by the recall of its descriptors; re-rank in jobs.evaluate"
+            )
         # R@5 chooses the best checkpoint, whatever else is asked for
         recalls = tuple(sorted({*config.validate.recalls, 5}))
         self.config = dataclasses.replace(config.validate, recalls=recalls)

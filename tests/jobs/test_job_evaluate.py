@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from job_process import JobProcess
 from PIL import Image
 
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, PoolingConfig
@@ -93,3 +94,28 @@ def test_what_is_missing_is_said_in_one_line(run_folder: Path) -> None:
     assert "Traceback" not in nothing.stderr
     unnamed = start(run_folder)
     assert unnamed.returncode == 2 and "--checkpoint is missing" in unnamed.stderr
+
+
+def test_the_challenge_is_written_in_the_line_format_of_its_server(run_folder: Path) -> None:
+    """No ground truth: no recall, but a line a query, `query_key key1 key2 ...`, nearest first, within its city."""
+    root = run_folder / "cities"
+    for city in ("athens", "miami"):
+        for side, count in (("database", 3), ("query", 2)):
+            base = root / "msls" / "test" / city / side
+            (base / "images").mkdir(parents=True)
+            for i in range(count):
+                field = np.random.default_rng([city == "miami", i]).integers(0, 256, (4, 4, 3), np.uint8)
+                photo = Image.fromarray(field).resize((60, 50), Image.Resampling.NEAREST)
+                photo.save(base / "images" / f"{city}_{side[0]}{i}.jpg", quality=95)
+            keys = "".join(f"{i},{city}_{side[0]}{i},True\n" for i in range(count))
+            (base / "subtask_index.csv").write_text(",key,all\n" + keys)
+    options = ["--checkpoint", str(run_folder / "run"), "--sets", "msls_challenge", "--root", str(root)]
+    options += ["--groups", "single", "--recalls", "1,2", "--workers", "0", "--output", str(run_folder / "challenge")]
+    job = JobProcess("jobs.evaluate", [*options, "--figures", "false"], run_folder / "challenge.log")
+    assert job.wait(240) == 0, job.text()
+    assert "single" in job.text()
+    lines = (run_folder / "challenge/predictions/msls_challenge.single.txt").read_text().splitlines()
+    assert sorted(line.split()[:2] for line in lines) == sorted(
+        [f"{city}_q{i}", f"{city}_d{i}"] for city in ("athens", "miami") for i in range(2)
+    )
+    assert all(key.startswith(line.split("_")[0]) for line in lines for key in line.split()) and len(lines) == 4

@@ -19,6 +19,7 @@ from PIL import Image
 from tiny import prepare, run_settings
 
 from pipeline.config import CrossImageConfig, EvaluationConfig, ModelConfig, RunConfig, from_dict
+from pipeline.config.model import BackboneConfig
 from pipeline.evaluation import paper
 from pipeline.experiments import plan, report, study
 from pipeline.experiments.rows import TABLES, Row, table
@@ -136,6 +137,13 @@ def test_rows_at_the_papers_size_are_the_papers() -> None:
     assert [plan.places(16, n) for n in (16, 32, 64, 72)] == [4, 8, 14, 16]
     assert [plan.dimensions(10752, n) for n in (512, 4096)] == [512, 4096]
     assert plan.dimensions(1344, 512) == 64
+    assert [plan.last_blocks(depth, 4) for depth in (12, 4, 2)] == [4, 1, 1]
+    small = RunConfig(model=ModelConfig(BackboneConfig(name="custom", depth=2)))
+    for base, trained in ((RunConfig(), 4), (small, 1)):
+        found = plan.training(base, TABLES["same_data"].rows["SALAD"], 0, lambda _: 900)
+        assert found.config.model.last_blocks == trained
+        told = plan.own_settings(TABLES["same_data"].rows["SALAD"], found, base, None)
+        assert told == ("" if trained == 4 else "last 1 of 2 blocks trained")
     steps = [plan.training(RunConfig(), row, 0, lambda _: 900).steps for row in TABLES["epochs"].rows.values()]
     assert steps == [9000, 4500, 900, 90]
     for n in range(4):

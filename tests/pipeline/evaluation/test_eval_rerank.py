@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from processes import run_ranks
 
-from pipeline.config import EvaluationConfig
+from pipeline.config import EvaluationConfig, ModelConfig, RunConfig
+from pipeline.config.baselines import ResNetConfig
+from pipeline.config.model import AdapterConfig, BackboneConfig, CrossImageConfig
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.evaluation_set import EvaluationSet
-from pipeline.evaluation.rerank import inliers, mutual_matches
-from shards.errors import UsageError
+from pipeline.evaluation.rerank import inliers, mutual_matches, rerank
+from pipeline.model.vpr import PlaceModel, build_model
+from pipeline.training.validation import Validation
+from shards.errors import DataError, UsageError
 
 
 def test_matches_are_mutual_and_nearest() -> None:
@@ -47,10 +52,13 @@ class Colours(torch.nn.Module):
     image_size, regions, descriptor_dim = 64, 1, 3
 
     class Backbone(torch.nn.Module):
-        grid, dim = 8, 3
+        patch = 8
+
+        def patches(self, images: torch.Tensor, layer: int | None = None) -> torch.Tensor:
+            return torch.nn.functional.avg_pool2d(images, self.patch).flatten(2).transpose(1, 2)
 
         def forward(self, images: torch.Tensor) -> torch.Tensor:
-            patches = torch.nn.functional.avg_pool2d(images, 8).flatten(2).transpose(1, 2)
+            patches = self.patches(images)
             return torch.cat((patches.mean(1, keepdim=True), patches), dim=1)
 
     def __init__(self) -> None:
@@ -97,6 +105,84 @@ def test_only_the_arrangement_tells_the_twin(scrambled: EvaluationSet) -> None:
 
 def test_too_coarse_a_grid_is_refused(scrambled: EvaluationSet) -> None:
     model = Colours()
-    model.backbone.grid = 3
-    with pytest.raises(UsageError, match="3 x 3 patches"):
+    model.backbone.patch = 20
+    with pytest.raises(UsageError, match="9 patches"):
         evaluate(model, [scrambled], EvaluationConfig(groups=("single",), workers=0, rerank=2), "cpu", progress=False)
+
+
+def reranked(evaluated: EvaluationSet) -> tuple[np.ndarray, np.ndarray] | str:
+    config = EvaluationConfig(groups=("single",), recalls=(1, 2), workers=0, rerank=4)
+    try:
+        (result,) = evaluate(Colours(), [evaluated], config, "cpu", progress=False)
+    except DataError as error:
+        return str(error)
+    return result.predictions, result.distances
+
+
+def test_the_queries_are_shared_by_the_processes(scrambled: EvaluationSet) -> None:
+    """Three processes share four queries and all get the answer of one."""
+    truth = reranked(scrambled)
+    for rank in run_ranks(reranked, 3, scrambled):
+        assert all((found == wanted).all() for found, wanted in zip(rank, truth, strict=True))
+
+
+def broken_after_the_search(evaluated: EvaluationSet) -> str:
+    rows = np.tile(np.arange(8), (4, 1))
+    try:
+        rerank(Colours(), evaluated, EvaluationConfig(rerank=4), "cpu", rows, rows.astype(np.float32))
+    except DataError as error:
+        return str(error)
+    return ""
+
+
+def test_a_photo_that_breaks_between_the_stages_ends_all_processes_with_its_name(scrambled: EvaluationSet) -> None:
+    scrambled.queries[0].write_bytes(b"nothing")
+    assert all("q0.png" in rank for rank in run_ranks(broken_after_the_search, 2, scrambled))
+
+
+def tiny_model(kind: str) -> PlaceModel:
+    """A transformer of two blocks and 4 x 4 patches, or a residual network of two stages."""
+    torch.manual_seed(0)
+    none = CrossImageConfig(layers=0)
+    if kind == "resnet":
+        resnet = BackboneConfig(name="resnet_custom", resnet=ResNetConfig(stages=(1, 1), width=4, cut="layer2"))
+        no_adapter = AdapterConfig(kind="none")
+        return build_model(ModelConfig(resnet, adapter=no_adapter, cross_image=none, train="full"), 64).eval()
+    custom = BackboneConfig(name="custom", dim=16, depth=2, heads=2, patch=7, pretrain_grid=4)
+    return build_model(ModelConfig(custom, AdapterConfig(reduced=4), cross_image=none), 28).eval()
+
+
+@pytest.mark.parametrize("kind", ["transformer", "resnet"])
+def test_patches_of_an_earlier_layer_are_what_that_layer_gives(kind: str) -> None:
+    """Against the layers called one by one; the last layer is what the model pools."""
+    model = tiny_model(kind)
+    backbone, images = model.backbone, torch.randn(2, 3, model.image_size, model.image_size)
+    with torch.no_grad():
+        assert torch.equal(backbone.patches(images), backbone(images)[:, 1:])
+        if kind == "resnet":
+            x = torch.relu(backbone.bn1(backbone.conv1(images)))
+            x = backbone.layer1(torch.nn.functional.max_pool2d(x, 3, 2, padding=1))
+            wanted = x.flatten(2).transpose(1, 2)
+        else:
+            wanted = backbone.vit.embeddings(images)
+            for block in backbone.blocks[:1]:
+                wanted = block(wanted)
+            wanted = backbone.vit.layernorm(wanted)[:, 1:]
+        torch.testing.assert_close(backbone.patches(images, 1), wanted)
+        assert torch.allclose(backbone.patches(images, backbone.depth), backbone.patches(images))
+    with pytest.raises(UsageError, match="1 to"):
+        backbone.patches(images, backbone.depth + 1)
+
+
+def test_a_layer_is_part_of_the_protocol_and_one_that_is_not_there_is_refused(scrambled: EvaluationSet) -> None:
+    model = tiny_model("transformer")
+    asked = EvaluationConfig(groups=("single",), recalls=(1,), workers=0, rerank=2, rerank_layer=1)
+    (result,) = evaluate(model, [scrambled], asked, "cpu", progress=False)
+    assert result.protocol.name == "single_rerank2l1" and "patches of layer 1" in result.protocol.describe()
+    with pytest.raises(UsageError, match="layer 9"):
+        evaluate(model, [scrambled], dataclasses.replace(asked, rerank_layer=9), "cpu", progress=False)
+
+
+def test_validation_takes_no_second_stage(scrambled: EvaluationSet) -> None:
+    with pytest.raises(UsageError, match=r"re-rank in jobs\.evaluate"):
+        Validation(RunConfig(validate=EvaluationConfig(rerank=2)), "cpu")

@@ -55,7 +55,6 @@ def test_the_common_layout_by_name(tmp_path: Path, name: str, folder: str, split
     assert [p.name for p in loaded.database] == DATABASE
     assert rows(loaded) == [[0], []]  # 25 m exactly counts, 35.4 m does not
     assert (loaded.rule, loaded.without_positives) == ("25 m", 1)
-    assert loaded.queries_without_positives == [loaded.queries[1]]
     assert loaded.database_positions is not None and loaded.database_positions[2].tolist() == [583_500, 4_477_100]
     assert any("published are" in remark for remark in loaded.remarks) or not SETS[loaded.name].counts
     assert rows(load_set(name, config(tmp_path, split=split, radius=40.0))) == [[0, 1], []]

@@ -136,6 +136,20 @@ def test_frames_are_green_where_right_and_red_where_wrong(street: EvaluationSet,
     assert colour_share(tmp_path / "wrong.png", figures.GREEN) < 0.0005
 
 
+class Corner(torch.nn.Module):
+    """Tokens of a 4 x 4 grid, large in the first cell of the second row alone."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.image_size, self.weight = 32, torch.nn.Parameter(torch.zeros(1))
+
+    def backbone(self, images: torch.Tensor) -> torch.Tensor:
+        tokens = torch.zeros(len(images), 17, 6)
+        tokens[:, 0] = 100  # the class token is no patch
+        tokens[:, 1 + 4] = 1
+        return tokens
+
+
 def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
     config = dataclasses.replace(CONFIG, groups=("single",))
     sequence = dataclasses.replace(street, name="seq", database_positions=None, query_positions=None, rule="+-2 frames")
@@ -143,8 +157,13 @@ def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
     sets = [street, sequence, unscored]
     results = [result for evaluated in sets for result in results_of(evaluated, config)]
     assert results[2].recalls == {}
-    pictures = report.draw(results, sets, tmp_path / "figures")
-    assert {p.path.name for p in pictures} >= {"pitts30k.curves.png", "seq.single.errors.png", "seq.single.worst.jpg"}
+    pictures = report.draw(results, sets, tmp_path / "figures", Corner())
+    drawn = {p.path.name for p in pictures}
+    assert drawn >= {"pitts30k.curves.png", "seq.single.errors.png", "seq.single.worst.jpg", "seq.attention.jpg"}
+    assert {name for name in drawn if name.startswith("unknown")} == {
+        "unknown.single.answers.jpg",
+        "unknown.attention.jpg",
+    }
     report.write_report(results, pictures, tmp_path / "report.html", "A <test>", {"checkpoint": "a&b"})
     page = (tmp_path / "report.html").read_text()
     assert page.count("<img") == len(pictures) == page.count("base64,")
@@ -153,19 +172,6 @@ def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
 
 
 def test_attention_lies_where_the_tokens_are_large(street: EvaluationSet, tmp_path: Path) -> None:
-    class Corner(torch.nn.Module):
-        """Tokens of a 4 x 4 grid, large in the first cell of the second row alone."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.image_size, self.weight = 32, torch.nn.Parameter(torch.zeros(1))
-
-        def backbone(self, images: torch.Tensor) -> torch.Tensor:
-            tokens = torch.zeros(len(images), 17, 6)
-            tokens[:, 0] = 100  # the class token is no patch
-            tokens[:, 1 + 4] = 1
-            return tokens
-
     maps = figures.attention_maps(Corner(), street.database[:2])
     assert maps.shape == (2, 4, 4) and np.argwhere(maps[0]).tolist() == [[1, 0]]
     figures.attention_overlay(Corner(), street.database[:2], tmp_path / "attention.png", "attention")

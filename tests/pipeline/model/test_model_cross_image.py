@@ -86,3 +86,28 @@ def test_dropout_acts_in_training_only() -> None:
 def test_no_layers_change_nothing() -> None:
     regions = torch.randn(2, REGIONS, DIM)
     assert torch.equal(CrossImageEncoder(DIM, CrossImageConfig(layers=0))(regions), regions)
+
+
+def alone_on_a_rank() -> dict[str, Tensor]:
+    encoder, regions, towards = problem()
+    encoder.alone = True
+    mine = rank_slice(IMAGES)
+    return results(encoder.train(), regions[mine], towards[mine])
+
+
+def test_the_control_is_the_same_layers_over_groups_of_one_also_in_training() -> None:
+    """`alone`: torch's encoder on one image at a time, gradients too; and no rank needs another."""
+    encoder, regions, towards = problem()
+    layer = nn.TransformerEncoderLayer(DIM, CONFIG.heads, CONFIG.feedforward, 0.0, "gelu", batch_first=False)
+    library = nn.TransformerEncoder(layer, CONFIG.layers, enable_nested_tensor=False).double()
+    library.load_state_dict(encoder.state_dict())
+    one_by_one = nn.Module()
+    one_by_one.layers = library.layers
+    one_by_one.forward = lambda x: torch.cat([library(image[None]) for image in x])  # type: ignore[method-assign]
+    truth = results(one_by_one, regions, towards)
+    assert CrossImageEncoder(DIM, CrossImageConfig(alone=True, heads=4)).alone
+    ranks = run_ranks(alone_on_a_rank, 2)
+    for name, theirs in truth.items():
+        parts = [r[name] for r in ranks]
+        ours = torch.cat(parts) if name in ("out", "regions") else torch.stack(parts).sum(0)
+        assert torch.allclose(ours, theirs, rtol=1e-10, atol=1e-12), name
