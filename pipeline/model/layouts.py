@@ -134,6 +134,11 @@ def _sequence(shapes: Shapes, prefix: str, pool_last: bool = False, matconvnet: 
     Returns:
         The backbone's settings and the rules for its names.
     """
+    if f"{prefix}0.weight" not in shapes:
+        raise shapes.refuse(
+            f"lacks '{prefix}0.weight', the first layer of VGG-16 or a ResNet, the networks known here (its first "
+            f"tensor is '{next(iter(shapes.shapes))}')"
+        )
     first = shapes.of(f"{prefix}0.weight", 4)
     if first == (64, 3, 3, 3) and f"{prefix}28.weight" in shapes and f"{prefix}1.weight" not in shapes:
         vgg = VGGConfig(cut="pool5" if pool_last else "conv5_3", layout="matconvnet" if matconvnet else "torchvision")
@@ -275,10 +280,10 @@ def salad(shapes: Shapes) -> Layout:
 def boq(shapes: Shapes) -> Layout:
     """BoQ on DINOv2 without its final norm, or on a ResNet cut open: in one list, or in a frozen and a trained one."""
     optional = COUNTERS
-    if "backbone.dino.cls_token" in shapes:
+    if any(name.startswith("backbone.dino.") for name in shapes.shapes):
         backbone, rules = _dinov2(shapes, "backbone.dino.", final_norm=False)
         base, size, optional = "BoQ", 322, r"mask_token$"
-    elif "backbone.net.0.weight" in shapes:
+    elif any(name.startswith("backbone.net.") for name in shapes.shapes):
         backbone, rules = _sequence(shapes, "backbone.net.")
         base, size = "ResNet50-BoQ", 384
     else:

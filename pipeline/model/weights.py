@@ -56,8 +56,15 @@ def from_published(
 
 
 def load_published(path: str | Path) -> PlaceModel:
-    """`from_published` of a file: a released CricaVPR .pth, or the same tensors as safetensors."""
-    return from_published(read_tensors(str(path)), str(path))
+    """The model of a released file, at its own input size: CricaVPR's, or that of another method.
+
+    Raises:
+        UsageError: nothing there, another layout, missing or surplus names, other shapes; DataError: broken.
+    """
+    from pipeline.model.releases import from_release, recognise  # which builds on this module
+
+    tensors = read_tensors(str(path))
+    return from_release(tensors, str(path)) if recognise(tensors) else from_published(tensors, str(path))
 
 
 def without_weights(config: ModelConfig, image_size: int) -> PlaceModel:

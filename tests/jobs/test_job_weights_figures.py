@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
+from releases_restated import SEQUENTIAL, filled, linear_shapes, resnet_shapes
 from tiny import make_evaluation, photo
 
 from jobs import figures, weights
@@ -43,7 +44,7 @@ def commands(page: str, job: str) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two runs, a CricaVPR and a DINOv2 release, photos, places and a set, under the names the pages use."""
+    """Two runs, three releases, photos, places and a set, under the names the pages use."""
     folder = tmp_path_factory.mktemp("weights")
     for seed, run in enumerate(("run", "other")):
         torch.manual_seed(seed)
@@ -60,6 +61,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.save({"model_state_dict": {f"module.{n}": t for n, t in state.items()}}, folder / "CricaVPR.pth")
     backbone = {n.removeprefix("backbone."): t for n, t in state.items() if n.startswith("backbone.")}
     torch.save({n: t for n, t in backbone.items() if ".adapter." not in n}, folder / "dinov2.pth")
+    layers = resnet_shapes([f"backbone.{part}" for part in SEQUENTIAL], (1, 1, 1, 1), width=8)
+    layers |= {"aggregation.1.p": (1,)} | linear_shapes("aggregation.3", 16, 256)
+    torch.save(filled(layers), folder / "ResNet50_512_cosplace.pth")
     (folder / "photos").mkdir()
     for place in range(36):
         (folder / "gsv" / f"place{place}").mkdir(parents=True)
@@ -93,7 +97,7 @@ def test_commands_of_the_weights_page(
     start(weights, monkeypatch, *words, *([] if "outputs/run" in words else SIZES))
     told = capsys.readouterr().out
     assert not target or (Path(target).is_file() and f"wrote {target}" in told)
-    if target in ("weights/cricavpr.safetensors", "weights/mine.safetensors", "weights/frozen.safetensors"):
+    if target in {f"weights/{name}.safetensors" for name in ("cricavpr", "cosplace", "mine", "frozen")}:
         assert load_model(target).image_size == 56
 
 
