@@ -10,11 +10,9 @@ that others use as well would need alone.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,6 +52,8 @@ class SearchBenchmarkJob:
 def main() -> None:
     """Makes or opens the descriptors, measures, prints a table."""
     job = parse(SearchBenchmarkJob, __doc__ or "")
+    from pipeline.benchmark.alone import alone
+
     threads = os.environ.get("OMP_NUM_THREADS", "all")
     with tempfile.TemporaryDirectory() as scratch:
         if job.pca:
@@ -61,12 +61,17 @@ def main() -> None:
             file = Path(scratch) / "rows.bin"
             make(file, job.rows, job.dim, job.seed, spectrum=True)
             for kind in ("ours", "scikit-learn") if job.sklearn else ("ours",):
-                print(f"{kind:<14}{_alone(_pca, job.timeout, kind, str(file), job.rows, job.dim, job.pca)}", flush=True)
+                print(
+                    f"{kind:<14}{_line(alone(_pca, job.timeout, kind, str(file), job.rows, job.dim, job.pca))}",
+                    flush=True,
+                )
             return
         database, queries, n, asked, dim = descriptors(job, Path(scratch))
         print(f"{asked:,} queries in {n:,} x {dim} descriptors, threads: {threads}", flush=True)
         for kind in job.kinds:
-            print(f"{kind:<8}{_alone(_search, job.timeout, kind, database, queries, dim, job.recalls)}", flush=True)
+            print(
+                f"{kind:<8}{_line(alone(_search, job.timeout, kind, database, queries, dim, job.recalls))}", flush=True
+            )
 
 
 def make(file: Path, rows: int, dim: int, seed: int, spectrum: bool = False, centres: int = 5_000) -> None:
@@ -102,45 +107,24 @@ def descriptors(job: SearchBenchmarkJob, scratch: Path) -> tuple[str, str, int, 
         make(files[0], job.rows, job.dim, job.seed)
         make(files[1], job.queries, job.dim, job.seed + 1)
         return str(files[0]), str(files[1]), job.rows, job.queries, job.dim
+    import numpy as np
+
     from pipeline.evaluation.store import DescriptorStore
 
     stores = [DescriptorStore(Path(job.store) / side) for side in ("database", "queries")]
     for store, file in zip(stores, files, strict=True):
-        store.array().astype("float32").tofile(file)
+        whole = np.memmap(file, np.float32, "w+", shape=(len(store), store.dim))
+        for rows, block in store.blocks():
+            whole[rows] = block
+        whole.flush()
     if stores[0].dim != stores[1].dim:
         raise DataError(f"{job.store}: database and queries have descriptors of different lengths; evaluate again")
     return str(files[0]), str(files[1]), len(stores[0]), len(stores[1]), stores[0].dim
 
 
-def _alone(work: Callable[..., str], timeout: float, *arguments: Any) -> str:
-    """The line of `work` from a fresh process, with that process's peak memory."""
-    context = multiprocessing.get_context("spawn")
-    answers: Any = context.SimpleQueue()
-    process = context.Process(target=_report, args=(work, answers, arguments))
-    process.start()
-    process.join(timeout)
-    if process.is_alive():
-        process.kill()
-        process.join()
-        return f"given up after {timeout:.0f} s"
-    if answers.empty():
-        return f"ended with code {process.exitcode}"
-    return str(answers.get())
-
-
-def _report(work: Callable[..., str], answers: Any, arguments: tuple[Any, ...]) -> None:
-    answers.put(f"{work(*arguments)}  peak {_peak() / 1e9:.2f} GB")
-
-
-def _peak() -> float:
-    """Largest resident memory of this process, bytes; of its own, where getrusage would count its parent's."""
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
-    except (OSError, StopIteration):
-        import resource
-
-        return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def _line(got: Any) -> str:
+    """What `alone` measured."""
+    return got.problem or f"{got.answer}  peak {got.peak / 1e9:.2f} GB"
 
 
 def _search(kind: str, database: str, queries: str, dim: int, ks: tuple[int, ...]) -> str:

@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from pipeline import distributed
 from pipeline.config import EvaluationConfig
 from pipeline.data.images import load_image, normalise, to_input
+from pipeline.evaluation.protocol import Protocol, Side
 from shards.errors import DataError
 from shards.progress import Progress
 
@@ -51,12 +52,12 @@ def blocks_of(groups: Sequence[np.ndarray], dim: int, limit: int = BLOCK_BYTES) 
     return blocks
 
 
-def calls_of(groups: list[np.ndarray], model: Any) -> tuple[list[np.ndarray], bool]:
+def calls_of(protocol: Protocol, images: int, side: Side, model: Any) -> tuple[list[np.ndarray], bool]:
     """(What is correlated in a call, whether its images are groups of one each): the groups, one a call; but of groups
     of one image `ALONE` together, where the model can. Cut by position, so the number of processes changes nothing."""
-    if max(map(len, groups)) > 1 or not getattr(model, "correlates_alone", False):
-        return groups, False
-    return [np.concatenate(groups[first : first + ALONE]) for first in range(0, len(groups), ALONE)], True
+    if protocol.group_size > 1 or not getattr(model, "correlates_alone", False):
+        return protocol.form(images, side), False
+    return protocol.form(images, side, ALONE), True
 
 
 class _Batches(torch.utils.data.Dataset[tuple[Tensor, str]]):

@@ -48,7 +48,7 @@ class Engine:
         """Encodes one side of a set, unless the store holds all of it under the `chosen` protocols."""
         paths = evaluated.database if side == "database" else evaluated.queries
         dim = int(self.model.descriptor_dim)
-        calls = {p: calls_of(p.form(len(paths), side), self.model) for p in chosen}
+        calls = {p: calls_of(p, len(paths), side, self.model) for p in chosen}
         blocks = {p: blocks_of(groups, dim) for p, (groups, _) in calls.items()}
         files = ""
         writers: dict[Protocol, StoreWriter] = {}

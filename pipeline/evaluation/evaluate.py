@@ -19,16 +19,17 @@ import torch
 from torch import nn
 
 from pipeline.config import EvaluationConfig
+from pipeline.evaluation import rerank as second_stage
 from pipeline.evaluation.descriptors import evaluating
 from pipeline.evaluation.engine import Engine, on_rank_0
 from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.projection import Projection, fit_rows, load_projection, projected, sample_rows
 from pipeline.evaluation.protocol import Protocol, Side, protocols
 from pipeline.evaluation.recall import recall_at
-from pipeline.evaluation.rerank import rerank
 from pipeline.evaluation.retrieval import (
     Blocks,
     agreement,
+    batches,
     build_index,
     index_bytes,
     search,
@@ -90,6 +91,8 @@ def evaluate(
     results: list[Result] = []
     with evaluating(model), tempfile.TemporaryDirectory() as temporary:
         engine = Engine(model, config, device, output, Path(temporary), progress, fingerprint or "")
+        if config.rerank:
+            second_stage.check(model, config, device)
         for evaluated in sets:
             chosen = protocols(config, engine.model.image_size, evaluated.rule)
             sides = {side: engine.side(evaluated, side, chosen) for side in SIDES}
@@ -98,8 +101,10 @@ def evaluate(
                 fitted = (projections or {}).get(protocol.grouping.name)
                 answer = on_rank_0(partial(answer_queries, evaluated, protocol, config, described, fitted))
                 if protocol.rerank:
-                    again = partial(rerank, engine.model, evaluated, config, device, answer[0], answer[1], progress)
-                    answer = (*on_rank_0(again), answer[2])
+                    ordered = second_stage.rerank(
+                        engine.model, evaluated, config, device, answer[0], answer[1], progress
+                    )
+                    answer = (*ordered, answer[2])
                 results.append(score(evaluated, protocol, config, *answer))
             for side in SIDES:
                 sides[side].close()
@@ -190,20 +195,30 @@ def answer_queries(
         about = f"{evaluated.name} database, {len(rows)} of {len(evaluated.database)} images, {protocol.grouping.name}"
         fitted = fitted or fit_rows(database, rows, protocol.pca, protocol.whiten, about)
         database, queries = projected(database, fitted), projected(queries, fitted)
-    asked = _in_order(queries, len(evaluated.queries))
     k = max(*config.recalls, protocol.rerank)
-    if evaluated.database_part is not None and evaluated.query_part is not None:
-        distances, rows = search_within(asked, evaluated.query_part, database, evaluated.database_part, k)
-        return rows, distances, ("each query is searched within its own part of the database",)
+    found = np.full((len(evaluated.queries), k), -1, np.int64)
+    distances = np.full((len(evaluated.queries), k), np.inf, np.float32)
+    parts = evaluated.database_part, evaluated.query_part
+    if parts[0] is not None and parts[1] is not None:
+        for numbers, asked in batches(queries):
+            distances[numbers], found[numbers] = search_within(asked, parts[1][numbers], database, parts[0], k)
+        return found, distances, ("each query is searched within its own part of the database",)
     if protocol.search == "exact":
-        distances, rows = search(asked, database(), k)
-        return rows, distances, ()
+        for numbers, asked in batches(queries):
+            distances[numbers], found[numbers] = search(asked, database(), k)
+        return found, distances, ()
     index = build_index(database, protocol.search)
-    distances, rows = search_index(index, asked, k)
-    sample = sample_rows(len(asked), 1_000)  # the exact answer of some queries tells what the approximation costs
-    found = agreement(rows[sample], search(asked[sample], database(), k)[1])
-    remark = f"{protocol.search} finds {found:.1f} % of the exact {k} neighbours ({len(sample):,} queries), index"
-    return rows, distances, (f"{remark} {index_bytes(index) / 1e6:,.1f} MB",)
+    sample = sample_rows(len(evaluated.queries), 1_000)  # the exact answer of some tells what the approximation costs
+    exact: list[np.ndarray] = []
+    near: list[np.ndarray] = []
+    for numbers, asked in batches(queries):
+        distances[numbers], found[numbers] = search_index(index, asked, k)
+        if (inside := np.isin(numbers, sample)).any():
+            exact.append(search(asked[inside], database(), k)[1])
+            near.append(found[numbers[inside]])
+    agreed = agreement(np.concatenate(near), np.concatenate(exact))
+    remark = f"{protocol.search} finds {agreed:.1f} % of the exact {k} neighbours ({len(sample):,} queries), index"
+    return found, distances, (f"{remark} {index_bytes(index) / 1e6:,.1f} MB",)
 
 
 def score(
@@ -231,17 +246,6 @@ def score(
         distances,
         tuple(evaluated.remarks) + remarks,
     )
-
-
-def _in_order(blocks: Blocks, rows: int) -> np.ndarray:
-    """All blocks as one array [rows, dim] in row order."""
-    whole: np.ndarray | None = None
-    for numbers, block in blocks():
-        if whole is None:
-            whole = np.empty((rows, block.shape[1]), block.dtype)
-        whole[numbers] = block
-    assert whole is not None  # an evaluation set has at least one query
-    return whole
 
 
 def _there(blocks: Blocks | None) -> Blocks:

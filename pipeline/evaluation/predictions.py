@@ -52,9 +52,9 @@ def save_predictions(result: Result, evaluated: EvaluationSet, folder: Path) -> 
     table = pa.table(
         {
             "query": pa.array([str(path) for path in evaluated.queries]),
-            "rows": pa.array(list(result.predictions), pa.list_(pa.int64())),
-            "distances": pa.array(list(result.distances.astype(np.float32)), pa.list_(pa.float32())),
-            "positives": pa.array([np.asarray(p, np.int64) for p in evaluated.positives], pa.list_(pa.int64())),
+            "rows": _lists(result.predictions.astype(np.int64, copy=False)),
+            "distances": _lists(result.distances.astype(np.float32, copy=False)),
+            "positives": _lists([np.asarray(p, np.int64) for p in evaluated.positives]),
             "rank": pa.array(first_hits(result.predictions, evaluated.positives)),
         }
     ).replace_schema_metadata({META: json.dumps(about)})
@@ -82,3 +82,10 @@ def load_predictions(path: Path) -> Predictions:
         [np.array(p, np.int64) for p in table["positives"].to_pylist()],
         table["rank"].to_numpy(),
     )
+
+
+def _lists(values: np.ndarray | list[np.ndarray]) -> pa.Array:
+    """A column of lists from [Q, K], or from Q arrays, without an object a number."""
+    lengths = np.fromiter(map(len, values), np.int64, len(values))
+    flat = values.ravel() if isinstance(values, np.ndarray) else np.concatenate([np.zeros(0, np.int64), *values])
+    return pa.ListArray.from_arrays(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32), flat)

@@ -113,8 +113,10 @@ class Protocol:
         """Plain values, as written beside every result."""
         return dataclasses.asdict(self)
 
-    def form(self, images: int, side: Side) -> list[np.ndarray]:
+    def form(self, images: int, side: Side, together: int = 1) -> list[np.ndarray]:
         """The groups of `images` images as arrays of positions (int64), covering each position once.
+
+        `together` consecutive groups share an array: an array an image takes more memory than the image's row number.
 
         Shuffled groups of database and queries come from different streams: were they the same, paired sets (frame i
         of the queries is frame i of the database) would group both sides alike and leak the answer.
@@ -124,7 +126,8 @@ class Protocol:
             # the raw stream of Philox is fixed for ever, where numpy's own shuffles may change between versions
             bits = np.random.Philox(key=[self.group_seed, int(side == "queries")]).random_raw(images)
             order = np.argsort(bits, kind="stable").astype(np.int64)
-        return [order[first : first + self.group_size] for first in range(0, images, self.group_size)]
+        size = self.group_size * together
+        return [order[first : first + size] for first in range(0, images, size)]
 
 
 def protocols(config: EvaluationConfig, image_size: int, rule: str) -> list[Protocol]:

@@ -18,6 +18,7 @@ from shards.errors import DataError, UsageError
 ROWS = 65_536  # database rows searched at once: their norms and faiss's temporaries, not the result, depend on it
 SLICE_BYTES = 2**28  # and the bytes of an array that are taken at once
 QUERIES = 4_096  # queries searched at once
+QUERY_BYTES = 2**28  # and the bytes of queries in memory; each time so many the database is read once
 Blocks = Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]
 """Gives the blocks (row numbers [n], descriptors [n, dim]) of a store or array afresh at each call."""
 
@@ -27,6 +28,20 @@ def slices(array: np.ndarray, rows: int = ROWS) -> Iterator[tuple[np.ndarray, np
     rows = max(1, min(rows, SLICE_BYTES // max(1, array[:1].nbytes)))
     for first in range(0, len(array), rows):
         yield np.arange(first, min(first + rows, len(array))), array[first : first + rows]
+
+
+def batches(queries: Blocks) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(row numbers [n], descriptors [n, dim]) of all queries as they come, some `QUERY_BYTES` at a time."""
+    rows: list[np.ndarray] = []
+    parts: list[np.ndarray] = []
+    for numbers, block in queries():
+        rows.append(numbers)
+        parts.append(block)
+        if sum(part.nbytes for part in parts) >= QUERY_BYTES:
+            yield np.concatenate(rows), np.concatenate(parts)
+            rows, parts = [], []
+    if rows:
+        yield np.concatenate(rows), np.concatenate(parts)
 
 
 def search(

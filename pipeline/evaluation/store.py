@@ -25,6 +25,8 @@ from pipeline.evaluation.protocol import Protocol, Side
 from shards.errors import DataError
 
 META = b"place_recognition"
+KEYS = 4_096  # paths compared at a time
+READ_BYTES = 2**24  # of descriptors read at a time: decoding needs a multiple of it
 
 
 @dataclass(frozen=True)
@@ -152,14 +154,18 @@ class DescriptorStore:
         return self.rows
 
     def blocks(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """(rows int64 [n], descriptors [n, dim] in the stored type), a part at a time."""
+        """(rows int64 [n], descriptors [n, dim] in the stored type), part by part, some `READ_BYTES` at a time."""
+        rows = max(1, READ_BYTES // (self.dim * self._width()))
         for file in self.files:
-            table = pq.read_table(file, columns=["row", "descriptor"])
-            for batch in table.to_batches():
-                flat = batch.column("descriptor").values
-                first = batch.column("descriptor").offset * self.dim  # `values` ignores the slice it belongs to
-                values = flat.slice(first, batch.num_rows * self.dim).to_numpy(zero_copy_only=False)
-                yield batch.column("row").to_numpy(), values.reshape(-1, self.dim)
+            with pq.ParquetFile(file, pre_buffer=False) as part:
+                for batch in part.iter_batches(rows, columns=["row", "descriptor"]):
+                    flat = batch.column("descriptor").values
+                    first = batch.column("descriptor").offset * self.dim  # `values` ignores the slice it belongs to
+                    values = flat.slice(first, batch.num_rows * self.dim).to_numpy(zero_copy_only=False)
+                    yield batch.column("row").to_numpy(), values.reshape(-1, self.dim)
+
+    def _width(self) -> int:
+        return 2 if self.protocol.stored == "fp16" else 4
 
     def array(self) -> np.ndarray:
         """All descriptors [rows, dim] in row order, in memory."""
@@ -172,9 +178,21 @@ class DescriptorStore:
         return whole
 
     def keys(self) -> list[str]:
-        """The images' paths in row order."""
+        """The images' paths in row order, all in memory; `holds` compares them without."""
         table = pa.concat_tables(pq.read_table(f, columns=["row", "key"]) for f in self.files).sort_by("row")
         return [str(key) for key in table["key"].to_pylist()]
+
+    def holds(self, paths: Sequence[Path]) -> bool:
+        """Whether row i is of `paths[i]`, however written, for exactly these images; some thousand in memory a time."""
+        if len(paths) != self.rows:
+            return False
+        for file in self.files:
+            with pq.ParquetFile(file) as part:
+                for batch in part.iter_batches(KEYS, columns=["row", "key"]):
+                    rows, keys = batch.column("row").to_pylist(), batch.column("key").to_pylist()
+                    if not all(_same(key, paths[row]) for row, key in zip(rows, keys, strict=True)):
+                        return False
+        return True
 
     def positions(self) -> np.ndarray | None:
         """UTM metres [rows, 2], or None where the set has no positions."""
@@ -183,6 +201,10 @@ class DescriptorStore:
         if table["utm_east"].null_count:
             return None
         return np.stack([table["utm_east"].to_numpy(), table["utm_north"].to_numpy()], axis=1)
+
+
+def _same(key: str, path: Path) -> bool:
+    return key == str(path) or Path(key).absolute() == path.absolute()
 
 
 def _about(path: Path) -> dict[str, Any]:

@@ -18,6 +18,18 @@ from pipeline.evaluation.store import DescriptorStore
 from shards.errors import DataError
 
 
+def stored_sets(output: Path) -> list[str]:
+    """Names of the sets with descriptors below `output`, the folder an evaluation wrote to.
+
+    Raises:
+        DataError: there are none.
+    """
+    names = sorted({f.parent.parent.name for f in (output / "descriptors").glob("*/*/database")})
+    if not names:
+        raise DataError(f"{output}: no descriptors/ in it; evaluate once with --store fp32 or fp16")
+    return names
+
+
 def evaluate_stores(
     output: Path, sets: Sequence[EvaluationSet], config: EvaluationConfig, dimensions: Sequence[int | None] = (None,)
 ) -> list[Result]:
@@ -62,5 +74,5 @@ def _belong(folder: Path, database: DescriptorStore, queries: DescriptorStore, e
     if database.about["model"] != queries.about["model"]:
         raise DataError(f"{folder}: database and queries were described by different weights; evaluate again")
     for store, paths in ((database, evaluated.database), (queries, evaluated.queries)):
-        if store.keys() != [str(path) for path in paths]:
+        if not store.holds(paths):
             raise DataError(f"{store.folder}: holds other images than {evaluated.name} has now; evaluate again")

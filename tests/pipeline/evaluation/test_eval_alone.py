@@ -84,8 +84,10 @@ def test_equal_to_each_image_by_itself_on_any_number_of_processes(
 
 
 def test_only_groups_of_one_are_called_together() -> None:
-    singles = [np.array([i]) for i in range(130)]
-    calls, alone = calls_of(singles, model())
+    config = EvaluationConfig(groups=("single", "ordered"), group_size=2)
+    single, pairs = protocols(config, 28, "")
+    calls, alone = calls_of(single, 130, "database", model())
     assert alone and [len(c) for c in calls] == [64, 64, 2] and np.concatenate(calls).tolist() == list(range(130))
-    pairs = [np.array([0, 1]), np.array([2])]
-    assert calls_of(pairs, model()) == (pairs, False) and calls_of(singles, object()) == (singles, False)
+    for protocol, built, size in ((pairs, model(), 2), (single, object(), 1)):
+        calls, alone = calls_of(protocol, 129, "database", built)
+        assert not alone and [len(c) for c in calls] == [size] * (129 // size) + [1] * (129 % size)
