@@ -1,17 +1,22 @@
 """Compare recorded runs: metrics, the settings that differ, recall curves, and whether differences are real.
 
-    python -m jobs.compare --runs first,second
+    python -m jobs.compare --runs first,second,third
+    python -m jobs.compare --evaluations outputs/RUN/evaluation,elsewhere/evaluation --pairs all
 
-Runs that jobs.evaluate has predictions of are compared query by query with the first of them: the difference in recall
-with its 95 % interval (paired bootstrap), called real only where McNemar's exact test agrees.
+Runs that jobs.evaluate has predictions of are compared query by query with the first of them, or each with each: the
+difference in recall with its 95 % interval (paired bootstrap), called real only where McNemar's exact test agrees.
+Folders of evaluations, also of jobs.stored or of a released model, are compared in this way alone, without MLflow.
 """
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from jobs.cli import parse, run_job
+from shards.errors import DataError, UsageError
 
 
 @dataclass(frozen=True)
@@ -20,6 +25,10 @@ class CompareJob:
 
     runs: tuple[str, ...] = ()
     """Names or MLflow ids, `[a,b]`; none: the newest run of each name."""
+    evaluations: tuple[str, ...] = ()
+    """Folders that jobs.evaluate or jobs.stored wrote to, instead of runs; they hold predictions/."""
+    pairs: Literal["first", "all"] = "first"
+    """Compare query by query with the first, or each with each."""
     experiment: str = "place-recognition"
     """MLflow experiment."""
     uri: str | None = None
@@ -32,6 +41,10 @@ def main() -> None:
     """Prints the table and the paths of what was written."""
     job = parse(CompareJob, __doc__ or "")
     from pipeline.evaluation import bootstrap
+
+    if job.evaluations:
+        compare_evaluations(job)
+        return
     from pipeline.training import comparison
     from pipeline.training.tracking import store_uri
 
@@ -44,7 +57,8 @@ def main() -> None:
     comparison.write_csv(table, folder / "comparison.csv")
     written = [folder / "comparison.md", folder / "comparison.csv"]
     names = list(dict.fromkeys(run.name for run in runs))
-    found, left_out = bootstrap.compare_folders([(n, Path(job.output) / n / "evaluation/predictions") for n in names])
+    folders = [(name, Path(job.output) / name / "evaluation/predictions") for name in names]
+    found, left_out = bootstrap.compare_folders(folders, every_pair=job.pairs == "all")
     if len(names) > 1:
         print(
             "\n" + "\n".join([bootstrap.as_text(found)] * bool(found) + [f"not compared: {note}" for note in left_out])
@@ -57,6 +71,28 @@ def main() -> None:
     if comparison.draw_curves(runs, folder / "recall_curves.png"):
         written.append(folder / "recall_curves.png")
     print("\nwritten: " + "  ".join(str(path) for path in written))
+
+
+def compare_evaluations(job: CompareJob) -> None:
+    """Query by query, what lies in the folders of `job.evaluations`."""
+    from pipeline.evaluation import bootstrap
+
+    if job.runs:
+        raise UsageError("give --runs or --evaluations, not both")
+    if len(set(job.evaluations)) < 2:
+        raise UsageError("--evaluations needs at least two different folders, one,another")
+    folders = [(name, Path(name) / "predictions") for name in dict.fromkeys(job.evaluations)]
+    found, left_out = bootstrap.compare_folders(folders, every_pair=job.pairs == "all")
+    for note in left_out:
+        print(f"not compared: {note}", file=sys.stderr)
+    if not found:
+        raise DataError("no two of these evaluations have the same queries of a set under the same protocol")
+    print(bootstrap.as_text(found))
+    folder = Path(job.output) / "comparison"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "differences.md").write_text(bootstrap.as_markdown(found))
+    bootstrap.write_csv(found, folder / "differences.csv")
+    print(f"\nwritten: {folder / 'differences.md'}  {folder / 'differences.csv'}")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ disagreeing queries). Both take queries as independent; neighbouring frames of a
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -104,12 +105,13 @@ def differences(first: Predictions, second: Predictions, runs: tuple[str, str], 
 
 
 def compare_folders(
-    runs: Sequence[tuple[str, Path]], ks: Sequence[int] = (1, 5, 10)
+    runs: Sequence[tuple[str, Path]], ks: Sequence[int] = (1, 5, 10), every_pair: bool = False
 ) -> tuple[list[Difference], list[str]]:
     """Every later run against the first, on every set and protocol both have predictions of.
 
     Args:
         runs: (name, folder of predictions); folders that are not there are told, not compared.
+        every_pair: each run against each earlier one, not against the first alone.
 
     Returns:
         (differences, what could not be compared and why).
@@ -117,8 +119,8 @@ def compare_folders(
     notes = [f"{name}: no predictions in {folder}; run jobs.evaluate on it" for name, folder in runs if not _in(folder)]
     there = [(name, folder) for name, folder in runs if _in(folder)]
     found: list[Difference] = []
-    for name, folder in there[1:]:
-        base, base_folder = there[0]
+    pairs = list(itertools.combinations(there, 2)) if every_pair else [(there[0], later) for later in there[1:]]
+    for (base, base_folder), (name, folder) in pairs:
         common = [file for file in _in(folder) if (base_folder / file).is_file()]
         if not common:
             notes.append(f"{name} and {base} have no set and protocol in common")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from job_process import JobProcess
 
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.bootstrap import as_text, compare_folders, differences, mcnemar, paired_interval, write_csv
@@ -108,3 +109,28 @@ def test_only_like_is_compared_with_like(tmp_path: Path) -> None:
     write_csv(found, tmp_path / "differences.csv")
     with (tmp_path / "differences.csv").open() as file:
         assert [row["real"] for row in csv.DictReader(file)] == ["False"] * 2
+
+
+def test_three_evaluations_against_the_first_or_each_with_each(tmp_path: Path) -> None:
+    """By the job: c finds 40 more than a, b two more; the three pairs against sums of their hits."""
+    hits = {"a": 60, "b": 62, "c": 100}
+    for name, found in hits.items():
+        ranks = np.full(200, -1)
+        ranks[:found] = 0
+        measured(tmp_path / name / "predictions", ranks)
+    names = [str(tmp_path / name) for name in hits]
+    for pairs, wanted in (("first", ["ab", "ac"]), ("all", ["ab", "ac", "bc"])):
+        options = ["--evaluations", ",".join(names), "--pairs", pairs, "--output", str(tmp_path / "out")]
+        job = JobProcess("jobs.compare", options, tmp_path / "log")
+        assert job.wait() == 0, job.text()
+        with (tmp_path / "out" / "comparison" / "differences.csv").open() as file:
+            rows = [row for row in csv.DictReader(file) if row["n"] == "1"]
+        assert [Path(r["first"]).name + Path(r["second"]).name for r in rows] == wanted
+        for row, (one, two) in zip(rows, wanted, strict=True):
+            assert float(row["difference"]) == pytest.approx((hits[two] - hits[one]) / 2)
+            assert row["real"] == str(abs(hits[two] - hits[one]) > 2)
+            assert float(row["low"]) <= float(row["difference"]) <= float(row["high"])
+        assert job.text().count("same queries, 95 % intervals") == len(wanted)
+    for options, code in ((names[:1], 2), ([*names[:1], str(tmp_path / "nothing")], 3)):
+        job = JobProcess("jobs.compare", ["--evaluations", ",".join(options)], tmp_path / "log")
+        assert job.wait() == code and "Traceback" not in job.text()
