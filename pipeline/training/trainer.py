@@ -135,6 +135,8 @@ class Trainer:
         if state.cursor >= self.steps_per_epoch:  # only now: until it is validated, an epoch is not over
             state.epoch, state.cursor = state.epoch + 1, 0
         self._save()
+        if not self._ended():
+            self._leave_if_asked()
 
     def _train_epoch(self) -> None:
         """The steps that are left of the current epoch."""
@@ -145,10 +147,7 @@ class Trainer:
         with meter:
             for batch in meter.wait(loader):
                 self._step(batch, meter)
-                if self._asked_to_stop():
-                    self._save()
-                    number = self.stops[0] if self.stops else "on another rank"
-                    raise Preempted(f"signal {number}: saved step {state.step}; start again to continue")
+                self._leave_if_asked()
                 if state.step >= self.total_steps and state.cursor < self.steps_per_epoch:
                     break  # train.steps falls inside the epoch
                 if state.step % config.train.save_every == 0 and state.cursor < self.steps_per_epoch:
@@ -241,8 +240,10 @@ class Trainer:
             )  # fmt: skip
 
         path = checkpoint.write(self.run, state, config, weights, optimizer)
-        if state.best_step == state.step or self.validation is None:
+        best = state.best_step == state.step
+        if best or self.validation is None:
             checkpoint.point(self.run, "best", path)
+        if best or (self.validation is None and self._ended()):  # others are replaced by the next
             self.tracker.checkpoint(path.resolve(), state.step, state.validated)
         checkpoint.prune(self.run, config.train.keep)
 
@@ -303,8 +304,12 @@ class Trainer:
             return "patience"
         return ""
 
-    def _asked_to_stop(self) -> bool:
-        return any_rank(bool(self.stops), self.accelerator.device)
+    def _leave_if_asked(self) -> None:
+        """Saves and raises `Preempted` where a rank was sent a signal (collective)."""
+        if any_rank(bool(self.stops), self.accelerator.device):
+            self._save()
+            number = self.stops[0] if self.stops else "on another rank"
+            raise Preempted(f"signal {number}: saved step {self.state.step}; start again to continue")
 
     def _plan(self, epoch: int) -> Any:
         data = self.config.data

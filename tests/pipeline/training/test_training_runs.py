@@ -239,6 +239,31 @@ def test_recorded_in_mlflow_and_continued_there(root: Path) -> None:
     assert {"config.yaml", "environment.yaml"} <= artifacts
 
 
+def test_without_validation_only_the_end_is_registered(root: Path) -> None:
+    """What stands in MLflow is there to be loaded: not checkpoints that later ones have replaced."""
+    from mlflow import MlflowClient
+
+    path = config(root, "unranked", tracking__enabled=True, train__keep=1)
+    train(path, "--validate.sets", "[]", "--train.save_every", "2")
+    client = MlflowClient(tracking_uri=f"sqlite:///{root / 'outputs/mlflow.db'}")
+    experiment = client.get_experiment_by_name("place-recognition")
+    models = client.search_logged_models([experiment.experiment_id])
+    (model,) = (m for m in models if m.name.startswith("unranked"))
+    assert model.tags["step"] == "12" and Path(model.tags["checkpoint"]).joinpath("model.safetensors").exists()
+
+
+def test_a_signal_during_a_validation_is_answered_before_the_next_step(root: Path, whole: str) -> None:
+    path = config(root, "signalled-validation")
+    job = start(path)
+    state = root / "outputs" / path.stem / "checkpoints/last/state.json"
+    job.kill_when(lambda: state.exists() and '"step": 6,' in state.read_text(), signal.SIGTERM, timeout=60)
+    assert job.wait() == 75, job.text()
+    left = json.loads(state.read_text())["state"]
+    assert (left["step"], left["validated_step"], left["epoch"]) == (6, 6, 1)
+    train(path)
+    assert same_bits(weights(root, path.stem), weights(root, whole))
+
+
 @pytest.mark.parametrize("changes", [{}, {"train__steps": 10}])
 def test_a_kill_in_the_last_validation_does_not_lose_it(root: Path, whole: str, changes: dict[str, Any]) -> None:
     """The last step is saved before its validation; what a kill in between leaves must still be validated."""
