@@ -162,11 +162,14 @@ def save_index(index: Any, path: Path) -> None:
 
 
 def load_index(path: Path) -> Any:
-    """Reads an index of `save_index`. Raises `DataError` for a file that is none."""
+    """Opens an index of `save_index`. Raises `DataError` for a file that is none.
+
+    Exact and hnsw vectors stay in the file, mapped, so that an index larger than memory answers from the disk.
+    """
     import faiss
 
     try:
-        return faiss.read_index(str(path))
+        return faiss.read_index(str(path), getattr(faiss, "IO_FLAG_MMAP_IFC", 0))  # older faiss reads all of it
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{path}: not a readable faiss index ({reason}); build it again") from None

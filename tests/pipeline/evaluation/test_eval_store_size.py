@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +76,7 @@ def test_predictions_keep_lists_of_any_length(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_no_step_needs_more_memory_for_four_times_the_rows(tmp_path: Path) -> None:
-    """25,000 and 100,000 x 1,344, two parts and nine; 300 MB more in float32 would be seen."""
+    """25,000 and 100,000 x 1,344, two parts and nine: 403 MB more in float32, which would be seen."""
     peaks: dict[int, dict[str, float]] = {}
     for rows in (25_000, 100_000):
         folder = tmp_path / str(rows)
@@ -92,4 +93,17 @@ def test_no_step_needs_more_memory_for_four_times_the_rows(tmp_path: Path) -> No
         assert got["recalls"].answer[1][0] == 100.0
         peaks[rows] = {name: m.peak for name, m in got.items()}
     grown = {name: (peaks[100_000][name] - peaks[25_000][name]) / 1e6 for name in peaks[25_000]}
-    assert all(value < 60 for value in grown.values()), grown
+    assert all(value < 150 for value in grown.values()), grown
+
+
+@pytest.mark.parametrize("kind", ["exact", "hnsw"])
+def test_an_opened_index_stays_on_the_disk(tmp_path: Path, kind: str) -> None:
+    """The kernel has the file's vectors mapped, all of them, and they answer."""
+    vectors = np.random.Generator(np.random.PCG64(0)).random((500, 2_000), np.float32) + 1
+    vectors[:3] = np.eye(3, 2_000)
+    retrieval.save_index(retrieval.build_index(partial(retrieval.slices, vectors), kind), tmp_path / "index")
+    index = retrieval.load_index(tmp_path / "index")
+    mapped = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if str(tmp_path) in line]
+    bounds = [[int(end, 16) for end in fields[0].split("-")] for fields in mapped]
+    assert sum(end - start for start, end in bounds) >= vectors.nbytes
+    assert retrieval.search_index(index, np.eye(3, 2_000, dtype=np.float32), 1)[1][:, 0].tolist() == [0, 1, 2]
