@@ -71,7 +71,7 @@ def gps_positions(paths: Sequence[Path], progress: bool = True) -> tuple[np.ndar
     line = ""
     if broken:
         more = f" and {len(broken) - NAMED:,} more" if len(broken) > NAMED else ""
-        line = f"no position for {len(broken):,} photos with broken GPS: {'; '.join(broken[:NAMED])}{more}"
+        line = f"broken GPS, taken for none, in {len(broken):,}: {'; '.join(broken[:NAMED])}{more}"
     return (None if np.isnan(degrees).all() else degrees), line
 
 

@@ -119,7 +119,7 @@ def test_a_folder_goes_into_one_zone_and_photos_without_stay(tmp_path: Path) -> 
     assert far == pytest.approx(metres_between(photos.degrees[3], photos.degrees[0]), rel=0.006)
     assert far == pytest.approx(120_000, rel=0.01)  # 1.487 degrees of 80.67 km each at this latitude
     assert len(photos.remarks) == 2 and "3 of 5 photos have a GPS position" in photos.remarks[1]
-    assert "no position for 1 photos" in photos.remarks[0] and "c zero.jpg: (0, 0)" in photos.remarks[0]
+    assert "broken GPS, taken for none, in 1: " in photos.remarks[0] and "c zero.jpg: (0, 0)" in photos.remarks[0]
 
 
 def test_names_come_first_and_the_whole_world_stays_in_degrees(tmp_path: Path) -> None:
