@@ -26,7 +26,7 @@ from shards.errors import DataError, UsageError
 class StoreBenchmarkJob:
     """Measure a store of each of `sizes`."""
 
-    sizes: tuple[str, ...] = ("500000x64", "2000000x64", "25000x1344", "100000x1344")
+    sizes: tuple[str, ...] = ("500000x64", "2000000x64", "60000x1344", "240000x1344")
     """Rows x dimensions of the database."""
     queries: int = 64
     """Queries, each another view of a known row."""

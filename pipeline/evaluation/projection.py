@@ -25,6 +25,7 @@ from pipeline.evaluation.retrieval import Blocks
 from shards.errors import DataError, UsageError
 
 SAMPLE = 16_384  # rows at most that PCA is fitted on (published: the same)
+PIECE = 2**21  # numbers projected at once
 DOUBLE = 1_024  # dimensions up to which the arithmetic is float64
 
 
@@ -47,11 +48,15 @@ class Projection:
     """What those rows were: set, number, protocol."""
 
     def __call__(self, descriptors: np.ndarray) -> np.ndarray:
-        """[n, D] -> [n, k] float32."""
-        # asarray copies a read-only memory map's block, which torch would warn about
-        centred = torch.from_numpy(np.array(descriptors, np.float32)) - self.mean
-        projected = centred @ self.components.T
-        return (projected / self.variances.sqrt() if self.whiten else projected).numpy()
+        """[n, D] -> [n, k] float32, some rows at a time."""
+        out = np.empty((len(descriptors), len(self.components)), np.float32)
+        rows = max(1, PIECE // len(self.mean))
+        for first in range(0, len(out), rows):
+            # array copies a read-only memory map's block, which torch would warn about
+            centred = torch.from_numpy(np.array(descriptors[first : first + rows], np.float32)).sub_(self.mean)
+            projected = centred @ self.components.T
+            out[first : first + rows] = projected / self.variances.sqrt() if self.whiten else projected
+        return out
 
     def save(self, path: Path) -> None:
         """Writes a safetensors file, whole or not at all."""
@@ -130,7 +135,7 @@ def fit_rows(
         for block in chosen():
             for first in range(0, len(block), 4096):
                 part = torch.from_numpy(np.array(block[first : first + 4096]))
-                yield (part.to(kind) - mean.to(kind)).to(device)
+                yield part.to(kind).sub_(mean.to(kind)).to(device)
 
     if count < dim:  # the Gram matrix is the smaller one, and the rows fit, being fewer than the dimensions
         matrix = torch.cat(list(centred()))

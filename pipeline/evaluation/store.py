@@ -163,6 +163,7 @@ class DescriptorStore:
                     first = batch.column("descriptor").offset * self.dim  # `values` ignores the slice it belongs to
                     values = flat.slice(first, batch.num_rows * self.dim).to_numpy(zero_copy_only=False)
                     yield batch.column("row").to_numpy(), values.reshape(-1, self.dim)
+                    pa.default_memory_pool().release_unused()  # or the peak creeps up with the number of parts
 
     def _width(self) -> int:
         return 2 if self.protocol.stored == "fp16" else 4
