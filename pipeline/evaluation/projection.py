@@ -139,8 +139,7 @@ def fit_rows(
 
     if count < dim:  # the Gram matrix is the smaller one, and the rows fit, being fewer than the dimensions
         matrix = torch.cat(list(centred()))
-        values, vectors = torch.linalg.eigh(matrix @ matrix.T)
-        values, vectors = values.flip(0)[:dims].clamp_min(0), vectors.flip(1)[:, :dims]
+        values, vectors = _largest(matrix @ matrix.T, dims)
         spread = float(matrix.square().sum())
         components = torch.linalg.qr(matrix.T @ (vectors / values.sqrt().clamp_min(1e-30)))[0].T
     else:
@@ -148,8 +147,8 @@ def fit_rows(
         for part in centred():
             covariance.addmm_(part.T, part)
         spread = float(covariance.trace())
-        values, vectors = torch.linalg.eigh(covariance)
-        values, components = values.flip(0)[:dims].clamp_min(0), vectors.flip(1)[:, :dims].T
+        values, vectors = _largest(covariance, dims)
+        components = vectors.T
     largest = components.gather(1, components.abs().argmax(1, keepdim=True))
     components = components * torch.where(largest < 0, -1.0, 1.0)
     variances = values / max(count - 1, 1)
@@ -172,3 +171,21 @@ def fit_rows(
 def projected(blocks: Blocks, projection: Projection) -> Blocks:
     """The same blocks, projected as they pass."""
     return lambda: ((numbers, projection(block)) for numbers, block in blocks())
+
+
+def _largest(matrix: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The largest eigenvalues [count], descending and not below 0, and eigenvectors [n, count] of a symmetric matrix.
+
+    `matrix` is overwritten.
+    """
+    if matrix.device.type != "cpu":
+        values, vectors = torch.linalg.eigh(matrix)
+        return values.flip(0)[:count].clamp_min(0), vectors.flip(1)[:, :count]
+    from scipy.linalg import eigh  # leaves out the vectors that nobody wants, which torch computes
+
+    n = len(matrix)
+    wanted = [n - count, n - 1]
+    # transposed, it lies in memory as LAPACK reads it, and is not copied
+    found = eigh(matrix.T.numpy(), subset_by_index=wanted, driver="evr", overwrite_a=True, check_finite=False)
+    values, vectors = (torch.from_numpy(np.ascontiguousarray(part[..., ::-1])) for part in found)
+    return values.clamp_min(0), vectors
