@@ -187,5 +187,5 @@ def _largest(matrix: Tensor, count: int) -> tuple[Tensor, Tensor]:
     wanted = [n - count, n - 1]
     # transposed, it lies in memory as LAPACK reads it, and is not copied
     found = eigh(matrix.T.numpy(), subset_by_index=wanted, driver="evr", overwrite_a=True, check_finite=False)
-    values, vectors = (torch.from_numpy(np.ascontiguousarray(part[..., ::-1])) for part in found)
+    values, vectors = (torch.from_numpy(part[..., ::-1].copy()) for part in found)
     return values.clamp_min(0), vectors
