@@ -98,6 +98,21 @@ class BasicBlock(nn.Module):
         return F.relu(self.bn2(self.conv2(x)) + skip)
 
 
+def check_trained(config: ModelConfig, stages: int) -> None:
+    """Whether a network of so many stages can be trained as `config` says.
+
+    Raises:
+        UsageError: adapters, or more last stages than there are.
+    """
+    if config.train == "adapters" or config.adapter.kind != "none":
+        raise UsageError(
+            f"adapters belong to transformer blocks and backbone {config.backbone.name} has none: set "
+            "model.adapter.kind none and model.train full, last or frozen"
+        )
+    if config.train == "last" and not 1 <= config.last_blocks <= stages:
+        raise UsageError(f"model.last_blocks {config.last_blocks} must lie between 1 and the {stages} stages used")
+
+
 class ResNet(nn.Module):
     """[b, 3, H, W] normalised images -> [b, 1 + h*w, D] tokens of the last stage used; the first is their mean.
 
@@ -119,17 +134,9 @@ class ResNet(nn.Module):
     def __init__(self, config: ModelConfig, image_size: int) -> None:
         super().__init__()
         settings, backbone = config.backbone.resnet, config.backbone
-        if config.train == "adapters" or config.adapter.kind != "none":
-            raise UsageError(
-                f"adapters belong to transformer blocks and backbone {backbone.name} has none: set model.adapter.kind "
-                "none and model.train full, last or frozen"
-            )
         self.layout = settings.layout
         self.depth = int(settings.cut.removeprefix("layer"))
-        if config.train == "last" and not 1 <= config.last_blocks <= self.depth:
-            raise UsageError(
-                f"model.last_blocks {config.last_blocks} must lie between 1 and the {self.depth} stages used"
-            )
+        check_trained(config, self.depth)
         with torch.device("meta") if backbone.weights else contextlib.nullcontext():
             self._build(settings, STAGES.get(backbone.name, settings.stages), backbone.name)
         # the buffers follow from the layout: never stored, and there also where the model is only shapes so far

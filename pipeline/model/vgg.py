@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pipeline.config import ModelConfig
-from pipeline.model.resnet import DEVIATION, MEAN
+from pipeline.model.resnet import DEVIATION, MEAN, check_trained
 from shards.errors import UsageError
 
 # channels and number of the 3x3 convolutions of each stage; stages are parted by 2x2 max pooling
@@ -59,14 +59,8 @@ class VGG(nn.Module):
     def __init__(self, config: ModelConfig, image_size: int) -> None:
         super().__init__()
         settings, backbone = config.backbone.vgg, config.backbone
-        if config.train == "adapters" or config.adapter.kind != "none":
-            raise UsageError(
-                f"adapters belong to transformer blocks and backbone {backbone.name} has none: set model.adapter.kind "
-                "none and model.train full, last or frozen"
-            )
         self.dim, self.depth = STAGES[-1][0], len(STAGES)
-        if config.train == "last" and not 1 <= config.last_blocks <= self.depth:
-            raise UsageError(f"model.last_blocks {config.last_blocks} must lie between 1 and the {self.depth} stages")
+        check_trained(config, self.depth)
         self.layout, self.pool_last = settings.layout, settings.cut == "pool5"
         self.grid = image_size // (32 if self.pool_last else 16)
         if self.grid < 1:
