@@ -24,7 +24,7 @@ class EvaluateJob(EvaluationConfig):
     """Evaluate a checkpoint. Without `sets`, every set found under `root`."""
 
     checkpoint: str = ""
-    """A run folder (its best checkpoint), a checkpoint folder, a .safetensors file, or a released CricaVPR .pth."""
+    """A run folder (its best checkpoint), a checkpoint folder, a .safetensors file, or a released .pth."""
     output: str | None = None
     """Folder of all results; none: `<run>/evaluation`."""
     track: bool = True

@@ -34,7 +34,7 @@ class FiguresJob(EvaluationConfig):
     groups: tuple[Literal["single", "shuffled", "ordered"], ...] = ("shuffled",)
     """How images share the cross-image encoder; the first counts."""
     checkpoint: str = ""
-    """Our model: a run or checkpoint folder, a file, or a released CricaVPR .pth."""
+    """Our model: a run or checkpoint folder, a file, or a released .pth."""
     baseline: tuple[str, ...] = ()
     """What it is compared with: models as for --checkpoint; attention and tsne also take a backbone's weights, and
     take the checkpoint's own backbone without its adapters where none is given."""

@@ -29,7 +29,7 @@ class LocateJob:
     """Build an index of photos, ask it, or both."""
 
     checkpoint: str = ""
-    """A run folder (its best checkpoint), a checkpoint folder, a .safetensors file, or a released CricaVPR .pth."""
+    """A run folder (its best checkpoint), a checkpoint folder, a .safetensors file, or a released .pth."""
     index: str = ""
     """Folder of the index; belongs to the checkpoint that made it."""
     photos: tuple[str, ...] = ()
