@@ -12,7 +12,7 @@ from typing import Any, Literal
 from jobs.cli import parse, run_job
 from shards.errors import UsageError
 
-MEMORY = {"demo": (72, 288, 1152), "vitb": (8, 16, 32), "tiny": (8, 32)}
+MEMORY = {"demo": (72, 288, 1152), "vitb": (8, 32, 288), "tiny": (8, 32)}
 
 
 @dataclass(frozen=True)
