@@ -86,6 +86,13 @@ def write_atomically(path: Path, data: bytes, temporary: Path | None = None) -> 
     sync_path(path.parent)
 
 
+def usual_permissions(path: Path) -> None:
+    """Those of a file that is simply opened: safetensors writes for the owner alone, and colleagues read these."""
+    mask = os.umask(0)
+    os.umask(mask)
+    path.chmod(0o666 & ~mask)
+
+
 def sync_path(path: Path) -> None:
     """Forces a file's bytes, or a folder's names, to the disk."""
     handle = os.open(path, os.O_RDONLY)

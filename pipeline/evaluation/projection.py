@@ -23,6 +23,7 @@ from torch import Tensor
 
 from pipeline.evaluation.retrieval import Blocks
 from shards.errors import DataError, UsageError
+from shards.shard_file import usual_permissions
 
 SAMPLE = 16_384  # rows at most that PCA is fitted on (published: the same)
 PIECE = 2**21  # numbers projected at once
@@ -67,6 +68,7 @@ class Projection:
         fresh = path.with_name(path.name + ".tmp")
         tensors = {"mean": self.mean, "components": self.components.contiguous(), "variances": self.variances}
         save_file(tensors, str(fresh), metadata={"projection": json.dumps(about)})
+        usual_permissions(fresh)
         fresh.replace(path)
 
 

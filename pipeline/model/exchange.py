@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from pipeline.model.weights import (
     save_model,
 )
 from shards.errors import DataError, UsageError
+from shards.shard_file import usual_permissions
 
 KINDS: dict[str, str] = {
     "model": "a model of this project",
@@ -139,7 +139,6 @@ def write_model(model: PlaceModel, path: Path, source: str) -> None:
         extra = read_metadata(checkpoint_file(source))["extra"] | extra
     config = dataclasses.replace(model.config, backbone=dataclasses.replace(model.config.backbone, weights=None))
     save_model(model, path, config, model.image_size, everything=True, extra=extra)
-    _open_to_others(path)
 
 
 def write_published(model: PlaceModel, path: Path) -> None:
@@ -188,14 +187,7 @@ def _replaced(path: Path, write: Callable[[Path], object]) -> None:
     partial = path.with_name(f".partial-{path.name}")
     try:
         write(partial)
-        _open_to_others(partial)
+        usual_permissions(partial)
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
-
-
-def _open_to_others(path: Path) -> None:
-    """The usual permissions: safetensors writes for the owner alone, and these files are made to be handed on."""
-    mask = os.umask(0)
-    os.umask(mask)
-    path.chmod(0o666 & ~mask)

@@ -22,6 +22,7 @@ from pipeline.model.names import fit, layout, to_published
 from pipeline.model.pretrained import read_tensors, unwrap
 from pipeline.model.vpr import PlaceModel, build_model
 from shards.errors import DataError, UsageError
+from shards.shard_file import usual_permissions
 
 FILE = "model.safetensors"
 FORMAT = "place-model 1"
@@ -146,6 +147,7 @@ def save_model(
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
     save_file(to_published({name: tensors[name] for name in names}), partial, metadata)
+    usual_permissions(partial)
     partial.replace(path)
 
 

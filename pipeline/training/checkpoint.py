@@ -24,7 +24,7 @@ from torch import Tensor
 
 from pipeline.config import RunConfig, flatten
 from shards.errors import DataError, UsageError
-from shards.shard_file import sync_path
+from shards.shard_file import sync_path, usual_permissions
 
 # Settings a resumed run may change: they decide where, how long and how fast, never what a step computes.
 FREE = (
@@ -92,6 +92,7 @@ def write(
     temporary.mkdir(parents=True)
     weights(temporary / "model.safetensors")
     save_file({k: v.contiguous() for k, v in optimizer.items()}, temporary / "optimizer.safetensors")
+    usual_permissions(temporary / "optimizer.safetensors")
     told = {"state": dataclasses.asdict(state), "config": flatten(config)}
     (temporary / "state.json").write_text(json.dumps(told, indent=1) + "\n")
     for file in temporary.iterdir():

@@ -286,3 +286,10 @@ def test_a_kill_in_the_last_validation_does_not_lose_it(root: Path, whole: str, 
     for key in ("step", "epoch", "cursor", "validated", "best", "best_step", "stale"):
         assert again[key] == finished["state"][key], key
     assert same_bits(weights(root, path.stem), weights(root, name))
+
+
+def test_colleagues_can_read_a_checkpoint(root: Path, whole: str) -> None:
+    mask = os.umask(0o022)
+    os.umask(mask)
+    files = list((root / "outputs" / whole / "checkpoints/last").iterdir())
+    assert len(files) == 3 and {file.stat().st_mode & 0o777 for file in files} == {0o666 & ~mask}
