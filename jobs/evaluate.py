@@ -16,7 +16,7 @@ from pathlib import Path
 
 from jobs.cli import parse, run_job
 from pipeline.config import EvaluationConfig, to_dict
-from shards.errors import DataError, UsageError
+from shards.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -50,26 +50,18 @@ def main() -> None:
 def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None:
     """The evaluation on this process; rank 0 writes."""
     from pipeline.evaluation import report, tables
-    from pipeline.evaluation.datasets import available, load_set
+    from pipeline.evaluation.datasets import available, load_set, load_sets
     from pipeline.evaluation.evaluate import evaluate, fit_projections, model_fingerprint
-    from pipeline.evaluation.msls import export_predictions
-    from pipeline.evaluation.predictions import save_predictions
-    from pipeline.model.weights import checkpoint_file, load_model, load_published, read_metadata
+    from pipeline.evaluation.predictions import save_results
+    from pipeline.model.weights import checkpoint_file, load_any, read_metadata
 
     device, first = accelerator.device, accelerator.is_main_process  # type: ignore[attr-defined]
     file = checkpoint_file(job.checkpoint)
     names = config.sets or tuple(a.name for a in available(config.root, config.split) if a.folder is not None)
-    sets, left_out = [], []
-    for name in names:
-        try:
-            sets.append(load_set(name, config))
-        except (DataError, UsageError) as error:
-            left_out.append(f"{name}: {error}")
-    if not sets:
-        raise DataError("; ".join(left_out) or f"no evaluation set under {config.root}/: give --sets or --root")
+    sets, left_out = load_sets(names, config)
     for line in left_out if first else ():
         print(f"left out: {line}", file=sys.stderr)
-    model = load_published(file).to(device) if file.suffix == ".pth" else load_model(file, device)
+    model = load_any(file, device)
     runs = [parent.parent for parent in file.parents if parent.name == "checkpoints"]
     output = Path(job.output) if job.output else (runs[0] if runs else file.parent) / "evaluation"
     fingerprint = model_fingerprint(model)
@@ -83,14 +75,7 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     print(tables.terminal(results))
     about = {"checkpoint": str(file), "fingerprint": fingerprint, "descriptor_dim": model.descriptor_dim}
     plain = {**about, "model": to_dict(model.config), "evaluation": to_dict(config), "left_out": left_out}
-    tables.write_json(results, output / "results.json", plain)
-    tables.write_csv(results, output / "results.csv")
-    (output / "results.md").write_text(tables.markdown(results))
-    for result in results:
-        evaluated = next(s for s in sets if s.name == result.set_name)
-        kept = save_predictions(result, evaluated, output / "predictions")
-        if evaluated.name == "msls_challenge":  # the benchmark takes a file
-            export_predictions(evaluated, result.predictions, kept.with_suffix(".txt"))
+    save_results(results, sets, output, plain)
     if job.figures:
         pictures = report.draw(results, sets, output / "figures", model)
         facts = {key: str(value) for key, value in about.items()}

@@ -98,12 +98,12 @@ def run(job: LocateJob) -> None:
     from pipeline.evaluation.evaluate import model_fingerprint
     from pipeline.evaluation.locate import locate
     from pipeline.evaluation.photo_index import make_index, open_index
-    from pipeline.model.weights import checkpoint_file, load_model, load_published
+    from pipeline.model.weights import checkpoint_file, load_any
 
     photos = asked(job.photos)
     device = job.device if job.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
     file, folder = checkpoint_file(job.checkpoint), Path(job.index)
-    model = load_published(file).to(device) if file.suffix == ".pth" else load_model(file, device)
+    model = load_any(file, device)
     fingerprint = model_fingerprint(model)
     if job.build:
         batch = job.batch or (1 if torch.device(device).type == "cpu" else 32)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 from jobs.cli import parse, run_job
-from shards.errors import DataError, UsageError
+from shards.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -59,32 +59,21 @@ def main() -> None:
         raise UsageError("--dimensions and --recalls start at 1")
     from pipeline.config import EvaluationConfig, to_dict
     from pipeline.evaluation import tables
-    from pipeline.evaluation.datasets import load_set
-    from pipeline.evaluation.predictions import save_predictions
+    from pipeline.evaluation.datasets import load_sets
+    from pipeline.evaluation.predictions import save_results
     from pipeline.evaluation.stored import evaluate_stores, stored_sets
 
     shared = {f.name for f in dataclasses.fields(EvaluationConfig)} & {f.name for f in dataclasses.fields(StoredJob)}
     config = EvaluationConfig(**{name: getattr(job, name) for name in shared})
     folder = Path(job.stores)
-    sets, left_out = [], []
-    for name in job.sets or stored_sets(folder):
-        try:
-            sets.append(load_set(name, config))
-        except (DataError, UsageError) as error:
-            left_out.append(f"{name}: {error}")
-    if not sets:
-        raise DataError("; ".join(left_out))
+    sets, left_out = load_sets(job.sets or stored_sets(folder), config)
     for line in left_out:
         print(f"left out: {line}", file=sys.stderr)
     results = evaluate_stores(folder, sets, config, (None, *job.dimensions))
     print(tables.terminal(results))
     output = Path(job.output) if job.output else folder / "from_store"
     about = {"stores": str(folder), "evaluation": to_dict(config), "left_out": left_out}
-    tables.write_json(results, output / "results.json", about)
-    tables.write_csv(results, output / "results.csv")
-    (output / "results.md").write_text(tables.markdown(results))
-    for result in results:
-        save_predictions(result, next(s for s in sets if s.name == result.set_name), output / "predictions")
+    save_results(results, sets, output, about)
     print(f"\nwritten to {output}/")
 
 

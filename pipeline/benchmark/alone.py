@@ -24,8 +24,8 @@ class Measured:
     """Why there is no answer."""
 
 
-def alone(work: Callable[..., Any], timeout: float, *arguments: Any) -> Measured:
-    """Runs `work(*arguments)`, a function of a module, in a spawned process for at most `timeout` seconds."""
+def alone(work: Callable[..., Any], timeout: float | None, *arguments: Any) -> Measured:
+    """Runs `work(*arguments)`, a function of a module, in a spawned process, for at most `timeout` seconds if given."""
     context = multiprocessing.get_context("spawn")
     answers: Any = context.SimpleQueue()
     process = context.Process(target=_report, args=(work, answers, arguments))

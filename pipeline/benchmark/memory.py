@@ -9,8 +9,6 @@ of weights and optimiser moments, which do not depend on the batch, are left out
 from __future__ import annotations
 
 import gc
-import multiprocessing
-import resource
 import sys
 import weakref
 from dataclasses import dataclass
@@ -22,6 +20,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from pipeline.benchmark.alone import alone, peak
 from pipeline.benchmark.sizes import SIZES, Norm, Size, bare, batch, build
 from pipeline.benchmark.timing import table
 from pipeline.model.vpr import PlaceModel
@@ -99,35 +98,22 @@ def count_fake(size: Size, norm: Norm, images: int, chunk: int | None) -> Bytes:
         return count(model, torch.empty(images, 3, size.image_size, size.image_size), chunk)
 
 
-def resident(name: str, norm: Norm, images: int, chunk: int | None) -> int:
+def resident(name: str, norm: Norm, images: int, chunk: int | None) -> float:
     """Bytes by which a fresh process's peak resident memory grows over its state before the step, on the CPU."""
-    context = multiprocessing.get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_resident, args=(sender, name, norm, images, chunk))
-    process.start()
-    sender.close()
-    try:
-        grown: int = receiver.recv()
-    except EOFError as error:
-        raise MemoryError(f"the process of {images} images ended without an answer: out of memory?") from error
-    finally:
-        process.join()
-    return grown
+    got = alone(_resident, None, name, norm, images, chunk)
+    if got.problem:
+        raise MemoryError(f"the process of {images} images {got.problem}: out of memory?")
+    return float(got.peak - got.answer)
 
 
-def _resident(sender: Any, name: str, norm: Norm, images: int, chunk: int | None) -> None:
+def _resident(name: str, norm: Norm, images: int, chunk: int | None) -> float:
     size = SIZES[name]
     model = build(size, norm)
     pixels, _ = batch(size, images)
     model(pixels[:8], chunk=chunk and min(chunk, 8)).sum().backward()  # libraries and weight gradients in memory
-    before = _peak()
+    before = peak()
     model(pixels, chunk=chunk).square().sum().backward()
-    sender.send(max(0, _peak() - before))
-    sender.close()
-
-
-def _peak() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return before
 
 
 def measure(name: str, batches: tuple[int, ...], limit: float) -> str:

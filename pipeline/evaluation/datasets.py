@@ -7,7 +7,7 @@ the same; a set that is missing or malformed raises `DataError` naming the folde
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from pipeline.evaluation.manifest import SUFFIXES, from_manifest
 from pipeline.evaluation.published import SETS, count_remark, published_name
 from shards.errors import DataError, UsageError
 
-__all__ = ["Availability", "EvaluationSet", "available", "list_images", "load_set"]
+__all__ = ["Availability", "EvaluationSet", "available", "list_images", "load_set", "load_sets"]
 
 DEFAULT_ROUTE = "night_right->day_right"
 SPLITS = ("train", "val", "test")
@@ -58,6 +58,19 @@ def load_set(name_or_path: str, config: EvaluationConfig) -> EvaluationSet:
     loaded = _load_path(path, config, route)
     # a folder called as a published set is compared with it: MSLS with 11,000 queries is not MSLS-val
     return _remarked(loaded, published_name(loaded.name), config.split)
+
+
+def load_sets(names: Sequence[str], config: EvaluationConfig) -> tuple[list[EvaluationSet], list[str]]:
+    """(The sets that are there, a line for each that is not). Raises `DataError` where none is."""
+    sets, left_out = [], []
+    for name in names:
+        try:
+            sets.append(load_set(name, config))
+        except (DataError, UsageError) as error:
+            left_out.append(f"{name}: {error}")
+    if not sets:
+        raise DataError("; ".join(left_out) or f"no evaluation set under {config.root}/: give --sets or --root")
+    return sets, left_out
 
 
 def _load_published(name: str, folder: Path, config: EvaluationConfig, route: str) -> EvaluationSet:

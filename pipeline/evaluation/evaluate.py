@@ -19,13 +19,13 @@ import torch
 from torch import nn
 
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation import rerank as second_stage
 from pipeline.evaluation.descriptors import evaluating
 from pipeline.evaluation.engine import Engine, on_rank_0
 from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.projection import Projection, fit_rows, load_projection, projected, sample_rows
 from pipeline.evaluation.protocol import Protocol, Side, protocols
 from pipeline.evaluation.recall import recall_at
+from pipeline.evaluation.rerank import PatchTokens, rerank
 from pipeline.evaluation.retrieval import (
     Blocks,
     agreement,
@@ -91,8 +91,7 @@ def evaluate(
     results: list[Result] = []
     with evaluating(model), tempfile.TemporaryDirectory() as temporary:
         engine = Engine(model, config, device, output, Path(temporary), progress, fingerprint or "")
-        if config.rerank:
-            second_stage.check(model, config, device)
+        tokens = PatchTokens(model, config, device) if config.rerank else None
         for evaluated in sets:
             chosen = protocols(config, engine.model.image_size, evaluated.rule)
             sides = {side: engine.side(evaluated, side, chosen) for side in SIDES}
@@ -100,11 +99,8 @@ def evaluate(
                 described = {side: sides[side].describe(protocol) for side in SIDES}
                 fitted = (projections or {}).get(protocol.grouping.name)
                 answer = on_rank_0(partial(answer_queries, evaluated, protocol, config, described, fitted))
-                if protocol.rerank:
-                    ordered = second_stage.rerank(
-                        engine.model, evaluated, config, device, answer[0], answer[1], progress
-                    )
-                    answer = (*ordered, answer[2])
+                if tokens is not None:
+                    answer = (*rerank(tokens, evaluated, answer[0], answer[1], progress), answer[2])
                 results.append(score(evaluated, protocol, config, *answer))
             for side in SIDES:
                 sides[side].close()

@@ -9,15 +9,19 @@ correct rows), `rank` (from 0, of the first correct one; -1 where none is among 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pipeline.evaluation import tables
 from pipeline.evaluation.evaluate import Result
 from pipeline.evaluation.evaluation_set import EvaluationSet
+from pipeline.evaluation.msls import export_predictions
 from pipeline.evaluation.protocol import Protocol
 from pipeline.evaluation.recall import first_hits
 from shards.errors import DataError
@@ -64,6 +68,21 @@ def save_predictions(result: Result, evaluated: EvaluationSet, folder: Path) -> 
     pq.write_table(table, fresh, compression="zstd")
     fresh.replace(path)
     return path
+
+
+def save_results(results: Sequence[Result], sets: Sequence[EvaluationSet], output: Path, about: dict[str, Any]) -> None:
+    """All that an evaluation leaves but pictures: results.json, results.csv, results.md, and predictions/.
+
+    MSLS-challenge also gets the file that its server takes. `about`: what results.json says of the model.
+    """
+    tables.write_json(results, output / "results.json", about)
+    tables.write_csv(results, output / "results.csv")
+    (output / "results.md").write_text(tables.markdown(results))
+    for result in results:
+        evaluated = next(s for s in sets if s.name == result.set_name)
+        kept = save_predictions(result, evaluated, output / "predictions")
+        if evaluated.name == "msls_challenge":
+            export_predictions(evaluated, result.predictions, kept.with_suffix(".txt"))
 
 
 def load_predictions(path: Path) -> Predictions:

@@ -74,11 +74,28 @@ def inliers(left: np.ndarray, right: np.ndarray, seed: tuple[int, int] = (0, 0))
 
 
 class PatchTokens:
-    """Unit patch tokens of an evaluation set's images, the most recently used kept."""
+    """Unit patch tokens of images, the most recently used kept: the same for every grouping of a set.
+
+    Args:
+        model: a `PlaceModel` in evaluation mode, whole on this rank. One blank image goes through it at once, so that
+            what cannot be matched is refused before hours of describing.
+
+    Raises:
+        UsageError: no such layer, or fewer than 4 x 4 patches; the same on all ranks.
+    """
 
     def __init__(self, model: Any, config: EvaluationConfig, device: torch.device | str) -> None:
         self.model, self.config, self.device = model, config, torch.device(device)
         self._kept: OrderedDict[Path, Tensor] = OrderedDict()
+        patches = len(self._patches(torch.zeros(3, model.image_size, model.image_size)))
+        if patches < SIDE * SIDE:
+            raise UsageError(f"rerank: {patches} patches an image are too few to check in space, 16 is the least")
+
+    def _patches(self, image: Tensor) -> Tensor:
+        """[3, S, S] normalised -> [G*G, D]."""
+        with torch.no_grad():
+            found: Tensor = self.model.backbone.patches(image[None].to(self.device), self.config.rerank_layer)[0]
+        return found
 
     def of(self, path: Path) -> Tensor:
         """[G*G, D], float16 and of unit length but for its rounding.
@@ -88,9 +105,7 @@ class PatchTokens:
         """
         if path not in self._kept:
             image = to_input(load_image(path), self.model.image_size, self.config.resize).to(self.device)
-            image = normalise(image) if image.dtype == torch.uint8 else image
-            with torch.no_grad():
-                tokens = self.model.backbone.patches(image[None], self.config.rerank_layer)[0]
+            tokens = self._patches(normalise(image) if image.dtype == torch.uint8 else image)
             self._kept[path] = F.normalize(tokens.float(), dim=-1).half()
             size = self._kept[path].numel() * 2
             while len(self._kept) * size > CACHE_BYTES and len(self._kept) > 1:
@@ -106,24 +121,9 @@ def score(query: Tensor, candidate: Tensor, seed: tuple[int, int]) -> int:
     return inliers(left % grid + 1j * (left // grid), right % grid + 1j * (right // grid), seed)
 
 
-def check(model: Any, config: EvaluationConfig, device: torch.device | str) -> None:
-    """Whether the model's patches can be matched as `config` asks, by one blank image: before hours of describing.
-
-    Raises:
-        UsageError: no such layer, or fewer than 4 x 4 patches; the same on all ranks.
-    """
-    blank = torch.zeros(1, 3, model.image_size, model.image_size, device=device)
-    with torch.no_grad():
-        patches = model.backbone.patches(blank, config.rerank_layer).shape[1]
-    if patches < SIDE * SIDE:
-        raise UsageError(f"rerank: {patches} patches an image are too few to check in space, at least 16 are needed")
-
-
 def rerank(
-    model: Any,
+    tokens: PatchTokens,
     evaluated: EvaluationSet,
-    config: EvaluationConfig,
-    device: torch.device | str,
     predictions: np.ndarray,
     distances: np.ndarray,
     progress: bool = False,
@@ -133,33 +133,33 @@ def rerank(
     Each rank takes consecutive queries, whose candidates overlap; every rank needs the whole model.
 
     Args:
-        model: a `PlaceModel` in evaluation mode.
+        tokens: of the model that made the descriptors; its configuration says how many candidates.
         predictions, distances: [Q, k] database rows (-1: none) and squared distances of the global search.
 
     Raises:
         UsageError: fewer candidates than are to be re-ranked; DataError: an image that cannot be read, on all ranks.
     """
-    if predictions.shape[1] < config.rerank:
-        raise UsageError(f"rerank {config.rerank} needs as many candidates, the search gave {predictions.shape[1]}")
-    tokens = PatchTokens(model, config, device)
+    first = tokens.config.rerank
+    if predictions.shape[1] < first:
+        raise UsageError(f"rerank {first} needs as many candidates, the search gave {predictions.shape[1]}")
     own = distributed.rank_slice(len(predictions))
-    scores = np.full((own.stop - own.start, config.rerank), -1, np.int64)
+    scores = np.full((own.stop - own.start, first), -1, np.int64)
     problem = ""
     label, show = f"re-ranking {evaluated.name}", progress and distributed.rank() == 0
     with Progress(label, len(scores), "queries of this rank", enabled=show) as bar:
         try:
             for i, q in enumerate(range(own.start, own.stop)):
                 query = tokens.of(evaluated.queries[q])
-                for j, row in enumerate(predictions[q, : config.rerank].tolist()):
+                for j, row in enumerate(predictions[q, :first].tolist()):
                     if row >= 0:
                         scores[i, j] = score(query, tokens.of(evaluated.database[row]), (q, row))
                 bar.advance()
         except (DataError, OSError) as error:
             problem = str(error)
-    raise_together(problem, torch.device(device))
-    all_scores = distributed.gather_uneven(torch.from_numpy(scores).to(device)).cpu().numpy()
+    raise_together(problem, tokens.device)
+    all_scores = distributed.gather_uneven(torch.from_numpy(scores).to(tokens.device)).cpu().numpy()
     order = np.argsort(-all_scores, axis=1, kind="stable")
     rows, kept = predictions.copy(), distances.copy()
-    rows[:, : config.rerank] = np.take_along_axis(predictions[:, : config.rerank], order, 1)
-    kept[:, : config.rerank] = np.take_along_axis(distances[:, : config.rerank], order, 1)
+    rows[:, :first] = np.take_along_axis(predictions[:, :first], order, 1)
+    kept[:, :first] = np.take_along_axis(distances[:, :first], order, 1)
     return rows, kept

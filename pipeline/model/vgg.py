@@ -115,5 +115,5 @@ class VGG(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """[b, 3, H, W] -> [b, 1 + h*w, 512]."""
-        patches = self.map(images).flatten(2).transpose(1, 2)
+        patches = self.patches(images)
         return torch.cat((patches.mean(1, keepdim=True), patches), dim=1)

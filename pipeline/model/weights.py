@@ -213,6 +213,12 @@ def load_model(path: str | Path, device: torch.device | str = "cpu") -> PlaceMod
     return model.to(device).eval()
 
 
+def load_any(path: str | Path, device: torch.device | str = "cpu") -> PlaceModel:
+    """What `--checkpoint` takes, in eval mode: `load_published` for a .pth, which ours never are, else `load_model`."""
+    file = checkpoint_file(path)
+    return load_published(file).to(device) if file.suffix == ".pth" else load_model(file, device)
+
+
 def load_trainable(model: PlaceModel, path: str | Path) -> dict[str, Any]:
     """Puts a file's trained weights (and all it holds) into a model built from the same config; gives its metadata.
 

@@ -135,8 +135,8 @@ class Trainer:
         if state.cursor >= self.steps_per_epoch:  # only now: until it is validated, an epoch is not over
             state.epoch, state.cursor = state.epoch + 1, 0
         self._save()
-        if not self._ended():
-            self._leave_if_asked()
+        if not self._ended() and self._asked_to_stop():
+            raise self._preempted()
 
     def _train_epoch(self) -> None:
         """The steps that are left of the current epoch."""
@@ -147,7 +147,9 @@ class Trainer:
         with meter:
             for batch in meter.wait(loader):
                 self._step(batch, meter)
-                self._leave_if_asked()
+                if self._asked_to_stop():
+                    self._save()
+                    raise self._preempted()
                 if state.step >= self.total_steps and state.cursor < self.steps_per_epoch:
                     break  # train.steps falls inside the epoch
                 if state.step % config.train.save_every == 0 and state.cursor < self.steps_per_epoch:
@@ -304,12 +306,12 @@ class Trainer:
             return "patience"
         return ""
 
-    def _leave_if_asked(self) -> None:
-        """Saves and raises `Preempted` where a rank was sent a signal (collective)."""
-        if any_rank(bool(self.stops), self.accelerator.device):
-            self._save()
-            number = self.stops[0] if self.stops else "on another rank"
-            raise Preempted(f"signal {number}: saved step {self.state.step}; start again to continue")
+    def _asked_to_stop(self) -> bool:
+        return any_rank(bool(self.stops), self.accelerator.device)
+
+    def _preempted(self) -> Preempted:
+        number = self.stops[0] if self.stops else "on another rank"
+        return Preempted(f"signal {number}: saved step {self.state.step}; start again to continue")
 
     def _plan(self, epoch: int) -> Any:
         data = self.config.data

@@ -16,7 +16,7 @@ from pipeline.config.baselines import ResNetConfig
 from pipeline.config.model import AdapterConfig, BackboneConfig, CrossImageConfig
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.evaluation_set import EvaluationSet
-from pipeline.evaluation.rerank import inliers, mutual_matches, rerank
+from pipeline.evaluation.rerank import PatchTokens, inliers, mutual_matches, rerank
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.training.validation import Validation
 from shards.errors import DataError, UsageError
@@ -129,7 +129,7 @@ def test_the_queries_are_shared_by_the_processes(scrambled: EvaluationSet) -> No
 def broken_after_the_search(evaluated: EvaluationSet) -> str:
     rows = np.tile(np.arange(8), (4, 1))
     try:
-        rerank(Colours(), evaluated, EvaluationConfig(rerank=4), "cpu", rows, rows.astype(np.float32))
+        rerank(PatchTokens(Colours(), EvaluationConfig(rerank=4), "cpu"), evaluated, rows, rows.astype(np.float32))
     except DataError as error:
         return str(error)
     return ""
