@@ -37,9 +37,9 @@ def place_model(path: str, device: str = "cpu", image_size: int | None = None) -
     Raises:
         UsageError: nothing there, or weights that do not fit; DataError: a broken file.
     """
+    from pipeline.common.errors import UsageError
     from pipeline.config import ModelConfig
-    from pipeline.model.exchange import kind_of, read_model
-    from shards.errors import UsageError
+    from pipeline.model.weights.convert import kind_of, read_model
 
     kind = kind_of(path)
     if kind == "backbone":
@@ -62,10 +62,10 @@ def _entry(name: str) -> Callable[..., PlaceModel]:
     def build(
         path: str | None = None, backbone: str | None = None, image_size: int | None = None, device: str = "cpu"
     ) -> PlaceModel:
-        from pipeline.model.exchange import around_backbone, fitting_backbone
+        from pipeline.common.errors import UsageError
         from pipeline.model.variants import variant
         from pipeline.model.vpr import build_model
-        from shards.errors import UsageError
+        from pipeline.model.weights.convert import around_backbone, fitting_backbone
 
         if path is not None:
             model = place_model(path, device, image_size)

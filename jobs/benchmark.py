@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from jobs.cli import parse, run_job
-from shards.errors import UsageError
+from pipeline.common.errors import UsageError
 
 MEMORY = {"demo": (72, 288, 1152), "vitb": (8, 32, 288), "tiny": (8, 32)}
 

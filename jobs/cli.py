@@ -4,7 +4,7 @@ jsonargparse was chosen over tyro after trying both on `RunConfig`: both show `-
 jsonargparse reads `--config FILE` and then overrides in order, with the file's keys checked against the types,
 where tyro needs the file parsed and turned into a default first.
 
-Exit codes: 0 done, 2 usage or configuration, 3 data, 4 diverged, 75 preempted and saved (`shards.errors`).
+Exit codes: 0 done, 2 usage or configuration, 3 data, 4 diverged, 75 preempted and saved (`pipeline.common.errors`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import typing
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, TypeVar
 
-from shards.errors import UsageError, UserError
+from pipeline.common.errors import UsageError, UserError
 
 Config = TypeVar("Config")
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from jobs.cli import parse, run_job
-from shards.errors import DataError, UsageError
+from pipeline.common.errors import DataError, UsageError
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class CompareJob:
 def main() -> None:
     """Prints the table and the paths of what was written."""
     job = parse(CompareJob, __doc__ or "")
-    from pipeline.evaluation import bootstrap
+    from pipeline.evaluation.report import significance
 
     if job.evaluations:
         compare_evaluations(job)
@@ -58,15 +58,16 @@ def main() -> None:
     written = [folder / "comparison.md", folder / "comparison.csv"]
     names = list(dict.fromkeys(run.name for run in runs))
     folders = [(name, Path(job.output) / name / "evaluation/predictions") for name in names]
-    found, left_out = bootstrap.compare_folders(folders, every_pair=job.pairs == "all")
+    found, left_out = significance.compare_folders(folders, every_pair=job.pairs == "all")
     if len(names) > 1:
         print(
-            "\n" + "\n".join([bootstrap.as_text(found)] * bool(found) + [f"not compared: {note}" for note in left_out])
+            "\n"
+            + "\n".join([significance.as_text(found)] * bool(found) + [f"not compared: {note}" for note in left_out])
         )
     if found:
         with (folder / "comparison.md").open("a") as file:
-            file.write("\n" + bootstrap.as_markdown(found))
-        bootstrap.write_csv(found, folder / "differences.csv")
+            file.write("\n" + significance.as_markdown(found))
+        significance.write_csv(found, folder / "differences.csv")
         written.append(folder / "differences.csv")
     if comparison.draw_curves(runs, folder / "recall_curves.png"):
         written.append(folder / "recall_curves.png")
@@ -75,23 +76,23 @@ def main() -> None:
 
 def compare_evaluations(job: CompareJob) -> None:
     """Query by query, what lies in the folders of `job.evaluations`."""
-    from pipeline.evaluation import bootstrap
+    from pipeline.evaluation.report import significance
 
     if job.runs:
         raise UsageError("give --runs or --evaluations, not both")
     if len(set(job.evaluations)) < 2:
         raise UsageError("--evaluations needs at least two different folders, one,another")
     folders = [(name, Path(name) / "predictions") for name in dict.fromkeys(job.evaluations)]
-    found, left_out = bootstrap.compare_folders(folders, every_pair=job.pairs == "all")
+    found, left_out = significance.compare_folders(folders, every_pair=job.pairs == "all")
     for note in left_out:
         print(f"not compared: {note}", file=sys.stderr)
     if not found:
         raise DataError("no two of these evaluations have the same queries of a set under the same protocol")
-    print(bootstrap.as_text(found))
+    print(significance.as_text(found))
     folder = Path(job.output) / "comparison"
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "differences.md").write_text(bootstrap.as_markdown(found))
-    bootstrap.write_csv(found, folder / "differences.csv")
+    (folder / "differences.md").write_text(significance.as_markdown(found))
+    significance.write_csv(found, folder / "differences.csv")
     print(f"\nwritten: {folder / 'differences.md'}  {folder / 'differences.csv'}")
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jobs.cli import parse, run_job
-from shards.errors import UserError
+from pipeline.common.errors import UserError
 
 RUNS = {
     "crica": "adapters, spatial pyramid, cross-image encoder, global batch (the paper's AdaptSPMG+Crica)",

@@ -1,6 +1,6 @@
 """How far each engine is from one process, measured: python -m jobs.engines [--engines '[ddp,zero2]'] [--processes 2]
 
-Launches every engine for three SGD steps of a small model (`pipeline.training.agreement`) and prints the largest
+Launches every engine for three SGD steps of a small model (`pipeline.training.engine_parity`) and prints the largest
 relative difference of any tensor's averaged gradient, and of the weights after the steps, from the same steps in one
 process in float64. Runs on CPU or GPUs, whichever `accelerate launch` finds; minutes on two cores.
 """
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from jobs.cli import parse, run_job
-from shards.errors import UsageError
+from pipeline.common.errors import UsageError
 
 CONFIGS = Path(__file__).parent / "accelerate"
 # DeepSpeed keeps its master weights in float32, whatever it is given
@@ -49,7 +49,7 @@ def main() -> None:
         return
     from safetensors.torch import load_file
 
-    from pipeline.training.agreement import compare
+    from pipeline.training.engine_parity import compare
 
     with tempfile.TemporaryDirectory() as folder:
         truth = load_file(_launch(job, "single", 1, "float64", Path(folder)))
@@ -84,7 +84,7 @@ def _measure(job: EnginesJob, file: str) -> None:
     from safetensors.torch import save_file
 
     from pipeline.config import TrainConfig
-    from pipeline.training.agreement import measure
+    from pipeline.training.engine_parity import measure
     from pipeline.training.launch import launched
 
     with launched(timeout=300.0) as accelerator:

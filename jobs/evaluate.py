@@ -3,7 +3,7 @@
     python -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k,msls_val --root data
     accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k
 
-Prints one table and writes results.json, results.md, results.csv, predictions/, figures/ and report.html. The number of
+Prints one table and writes results.json, results.md, results.csv, predictions/, figures/ and html.html. The number of
 processes changes nothing but the time. Sets that are missing are named and left out; exit code 3 when none is there.
 """
 
@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jobs.cli import parse, run_job
+from pipeline.common.errors import UsageError
 from pipeline.config import EvaluationConfig, to_dict
-from shards.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,12 @@ def main() -> None:
 
 def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None:
     """The evaluation on this process; rank 0 writes."""
-    from pipeline.evaluation import report, tables
-    from pipeline.evaluation.datasets import available, load_set, load_sets
     from pipeline.evaluation.evaluate import evaluate, fit_projections, model_fingerprint
     from pipeline.evaluation.predictions import save_results
-    from pipeline.model.weights import checkpoint_file, load_any, read_metadata
+    from pipeline.evaluation.report import html, tables
+    from pipeline.evaluation.sets.load import available, load_set, load_sets
+    from pipeline.model.weights.files import checkpoint_file, read_metadata
+    from pipeline.model.weights.load import load_any
 
     device, first = accelerator.device, accelerator.is_main_process  # type: ignore[attr-defined]
     file = checkpoint_file(job.checkpoint)
@@ -77,16 +78,16 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     plain = {**about, "model": to_dict(model.config), "evaluation": to_dict(config), "left_out": left_out}
     save_results(results, sets, output, plain)
     if job.figures:
-        pictures = report.draw(results, sets, output / "figures", model)
+        pictures = html.draw(results, sets, output / "figures", model)
         facts = {key: str(value) for key, value in about.items()}
         title = f"Evaluation of {(runs[0] if runs else file).name}"
-        report.write_report(results, pictures, output / "report.html", title, facts)
+        html.write_report(results, pictures, output / "html.html", title, facts)
     if job.track and runs:
         from pipeline.training.tracking import record_evaluation
 
         values = {name: value for entry in tables.as_dicts(results) for name, value in entry["metrics"].items()}
         record_evaluation(runs[0], read_metadata(file)["extra"], values, output)
-    print(f"\nwritten to {output}/" + (": open report.html in a browser" if job.figures else ""))
+    print(f"\nwritten to {output}/" + (": open html.html in a browser" if job.figures else ""))
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from jobs.cli import parse, run_job
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig, RunConfig
-from shards.errors import DataError, UsageError
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,9 @@ def main() -> None:
         return
     if not job.table:
         raise UsageError("--table is missing, for example --table ablation_crica")
-    from pipeline.experiments import report, study
-    from pipeline.experiments.rows import table
-    from pipeline.experiments.runner import Runner
+    from pipeline.paper import study, table_report
+    from pipeline.paper.rows import table
+    from pipeline.paper.runner import Runner
 
     base = RunConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(RunConfig)})
     wanted = dataclasses.replace(job.evaluate, sets=job.sets, root=job.root)
@@ -68,7 +68,7 @@ def main() -> None:
     shards = {"pitts30k_shards": job.pitts30k_shards}
     filled = study.build(job.table, table(job.table), base, wanted, job.seeds, runner, shards, job.resnet_weights)
     if job.dry_run:
-        print(report.costs(filled, job.images_per_second))
+        print(table_report.costs(filled, job.images_per_second))
         return
     for line in filled.missing:
         print(f"missing: {line}", file=sys.stderr)
@@ -76,14 +76,14 @@ def main() -> None:
         raise DataError(f"no evaluation set of the table is there: give --root or --sets ({'; '.join(filled.missing)})")
     filled.fill()
     folder = Path(job.output) / "tables" / job.table
-    report.write(filled, folder)
-    print(report.terminal(filled))
+    table_report.write(filled, folder)
+    print(table_report.terminal(filled))
     print(f"\nwritten to {folder}/: table.md, table.csv, table.png")
 
 
 def measure(order: Path, timeout: float) -> None:
     """The evaluations of one trained run, on every process that was launched."""
-    from pipeline.experiments.measure import measure as carry_out
+    from pipeline.paper.measure import measure as carry_out
     from pipeline.training.launch import launched
 
     with launched(timeout) as accelerator:

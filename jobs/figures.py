@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from jobs.cli import parse, run_job
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig, ModelConfig
-from shards.errors import DataError, UsageError
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ def main() -> None:
 
 def parameters(job: FiguresJob) -> None:
     """Prints the table; writes markdown where asked."""
-    from pipeline.model import parameter_table
     from pipeline.model.variants import VARIANTS
+    from pipeline.paper import parameter_table
 
     rows = parameter_table.table(job.variants or VARIANTS)
     print(parameter_table.as_text(rows))
@@ -90,9 +90,9 @@ def parameters(job: FiguresJob) -> None:
 
 def attention(job: FiguresJob, model: Any, device: Any) -> None:
     """Frozen and adapted backbone side by side."""
-    from pipeline.evaluation.figures import attention_maps
-    from pipeline.evaluation.paper_figures import attention_comparison
-    from pipeline.evaluation.place_features import pretrained
+    from pipeline.evaluation.report.figures import attention_maps
+    from pipeline.paper.paper_figures import attention_comparison
+    from pipeline.paper.place_features import pretrained
 
     photos = _photos(job.photos)
     maps = []
@@ -108,8 +108,8 @@ def attention(job: FiguresJob, model: Any, device: Any) -> None:
 
 def places(job: FiguresJob, model: Any, device: Any) -> None:
     """t-SNE of places before adaptation, after it, and of the complete model."""
-    from pipeline.evaluation.paper_figures import place_maps
-    from pipeline.evaluation.place_features import choose_places, stages
+    from pipeline.paper.paper_figures import place_maps
+    from pipeline.paper.place_features import choose_places, stages
 
     if not job.places_from:
         raise UsageError("--places-from is missing: a folder in GSV-Cities' layout, or one with a folder a place")
@@ -126,9 +126,9 @@ def places(job: FiguresJob, model: Any, device: Any) -> None:
 
 def qualitative(job: FiguresJob, model: Any, device: Any) -> None:
     """First answers where the model and a baseline differ."""
-    from pipeline.evaluation.datasets import load_set
     from pipeline.evaluation.evaluate import evaluate
-    from pipeline.evaluation.paper_figures import retrieval_comparison
+    from pipeline.evaluation.sets.load import load_set
+    from pipeline.paper.paper_figures import retrieval_comparison
 
     if not job.baseline or len(job.sets) != 1:
         raise UsageError("--kind qualitative wants --baseline (one model or more) and one set in --sets")
@@ -148,17 +148,17 @@ def _config(job: FiguresJob) -> EvaluationConfig:
 
 def _model(source: str, like: Any | None, device: Any) -> Any:
     """A model; or, where one is given to compare with, released weights in a backbone like its own."""
-    from pipeline.model import exchange
+    from pipeline.model.weights import convert
 
-    kind = exchange.kind_of(source)
+    kind = convert.kind_of(source)
     if kind != "backbone":
-        return exchange.read_model(source, kind, ModelConfig(), None).to(device)
+        return convert.read_model(source, kind, ModelConfig(), None).to(device)
     if like is None:
         raise UsageError(f"{source}: a backbone alone; make it a model first: jobs.weights --variant FrozenDINOv2-SPM")
     from pipeline.model.variants import variant
 
     config = variant("FrozenDINOv2-SPM", like.config)
-    return exchange.around_backbone(source, config, int(like.image_size)).to(device)
+    return convert.around_backbone(source, config, int(like.image_size)).to(device)
 
 
 def _photos(given: tuple[str, ...], each: int = 6) -> list[Path]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from jobs.cli import parse, run_job
-from shards.errors import UsageError
+from pipeline.common.errors import UsageError
 
 SHOWN = 12  # photos that ask, in the picture; the text and the JSON have all
 
@@ -96,9 +96,10 @@ def run(job: LocateJob) -> None:
 
     from pipeline.config import EvaluationConfig
     from pipeline.evaluation.evaluate import model_fingerprint
-    from pipeline.evaluation.locate import locate
-    from pipeline.evaluation.photo_index import make_index, open_index
-    from pipeline.model.weights import checkpoint_file, load_any
+    from pipeline.locate.answers import locate
+    from pipeline.locate.photo_index import make_index, open_index
+    from pipeline.model.weights.files import checkpoint_file
+    from pipeline.model.weights.load import load_any
 
     photos = asked(job.photos)
     device = job.device if job.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
@@ -126,7 +127,7 @@ def run(job: LocateJob) -> None:
 
 def asked(given: Sequence[str]) -> list[Path]:
     """The photos of the command line, folders unfolded. Raises `UsageError` for what is not there."""
-    from pipeline.evaluation.evaluation_set import list_images
+    from pipeline.evaluation.sets.evaluation_set import list_images
 
     photos: list[Path] = []
     for path in map(Path, given):
@@ -138,9 +139,9 @@ def asked(given: Sequence[str]) -> list[Path]:
 
 def tell(job: LocateJob, index: object, answers: Sequence[object]) -> None:
     """Prints the answers and writes them down."""
-    from pipeline.evaluation import figures
-    from pipeline.evaluation.locate import Answer, place_text
-    from pipeline.evaluation.photo_index import PhotoIndex
+    from pipeline.evaluation.report import figures
+    from pipeline.locate.answers import Answer, place_text
+    from pipeline.locate.photo_index import PhotoIndex
 
     assert isinstance(index, PhotoIndex)
     root = index.about["root"]

@@ -36,7 +36,7 @@ def main() -> None:
     config = parse(MiniatureConfig, "Draw the miniature city in GSV-Cities' and the evaluation folders' layouts.")
     from pathlib import Path
 
-    from shards.miniature import draw
+    from shards.sources.miniature import draw
 
     summary = draw(
         Path(config.out), config.places, config.seed, (config.width, config.height), config.workers,

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from jobs.cli import parse, run_job
-from shards.errors import DataError, UsageError
+from pipeline.common.errors import DataError, UsageError
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def verify(root: str) -> None:
 def prepare(config: PrepareConfig, source: Path, out: Path) -> None:
     """Reads the source, writes the shard set, prints the summary."""
     from shards.images import ImageRule
-    from shards.sources import SourceRule, read_source, reading_settings
+    from shards.sources.registry import SourceRule, read_source, reading_settings
     from shards.writer import WriteRule, remove_shards, write_shards
 
     reading = SourceRule(config.kind, tuple(config.cities), config.cell_m, config.heading_deg)

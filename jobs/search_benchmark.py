@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from jobs.cli import parse, run_job
-from shards.errors import DataError, UsageError
+from pipeline.common.errors import DataError, UsageError
 
 BLOCK = 2_048  # rows made or read at a time
 
@@ -52,7 +52,7 @@ class SearchBenchmarkJob:
 def main() -> None:
     """Makes or opens the descriptors, measures, prints a table."""
     job = parse(SearchBenchmarkJob, __doc__ or "")
-    from pipeline.benchmark.alone import alone
+    from pipeline.benchmark.own_process import alone
 
     threads = os.environ.get("OMP_NUM_THREADS", "all")
     with tempfile.TemporaryDirectory() as scratch:
@@ -109,7 +109,7 @@ def descriptors(job: SearchBenchmarkJob, scratch: Path) -> tuple[str, str, int, 
         return str(files[0]), str(files[1]), job.rows, job.queries, job.dim
     import numpy as np
 
-    from pipeline.evaluation.store import DescriptorStore
+    from pipeline.evaluation.describe.store import DescriptorStore
 
     stores = [DescriptorStore(Path(job.store) / side) for side in ("database", "queries")]
     for store, file in zip(stores, files, strict=True):
@@ -130,7 +130,7 @@ def _line(got: Any) -> str:
 def _search(kind: str, database: str, queries: str, dim: int, ks: tuple[int, ...]) -> str:
     import numpy as np
 
-    from pipeline.evaluation.retrieval import agreement, build_index, index_bytes, search, search_index, slices
+    from pipeline.evaluation.search.exact import agreement, build_index, index_bytes, search, search_index, slices
 
     rows = np.memmap(database, np.float32, "r").reshape(-1, dim)
     asked = np.fromfile(queries, np.float32).reshape(-1, dim)
@@ -157,7 +157,7 @@ def _pca(kind: str, file: str, rows: int, dim: int, dims: int) -> str:
                 yield np.arange(first, first + len(block)), block
 
     if kind == "ours":
-        from pipeline.evaluation.projection import fit_rows
+        from pipeline.evaluation.search.projection import fit_rows
 
         start, busy = time.perf_counter(), time.process_time()
         explained = fit_rows(blocks, np.arange(rows), dims).explained

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from jobs.cli import parse, run_job
-from shards.errors import DataError, UsageError
+from pipeline.common.errors import DataError, UsageError
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ def main() -> None:
         if found is None:
             raise UsageError(f"--sizes {text}: give rows x dimensions, such as 100000x256")
         sizes.append((int(found[1]), int(found[2])))
-    from pipeline.benchmark import store
-    from pipeline.benchmark.alone import alone
+    from pipeline.benchmark import store_size
+    from pipeline.benchmark.own_process import alone
 
     for rows, _ in sizes:
-        if (job.queries - 1) * store.APART >= rows:
-            raise UsageError(f"--queries {job.queries} needs more than {(job.queries - 1) * store.APART:,} rows")
-    base = alone(store.baseline, job.timeout).peak
+        if (job.queries - 1) * store_size.APART >= rows:
+            raise UsageError(f"--queries {job.queries} needs more than {(job.queries - 1) * store_size.APART:,} rows")
+    base = alone(store_size.baseline, job.timeout).peak
     print(f"threads {os.environ.get('OMP_NUM_THREADS', 'all')}, {job.queries} queries, stored {job.stored}, PCA to "
           f"{job.dims}; libraries alone {base / 1e6:,.0f} MB\n\n{'rows x dim':>18}  {'step':<14}{'peak MB':>9}"
           f"{'above libraries':>17}{'seconds':>10}", flush=True)  # fmt: skip
@@ -81,16 +81,16 @@ def main() -> None:
 
 def steps(job: StoreBenchmarkJob, folder: Path, rows: int, dim: int) -> list[tuple[str, Callable[..., Any], Any]]:
     """(Name, work, its arguments) of every step."""
-    from pipeline.benchmark import store
+    from pipeline.benchmark import store_size
 
     return [
-        ("write", store.write, (folder, rows, job.queries, dim, job.stored)),
-        ("read", store.read, (folder,)),
-        ("exact search", store.find, (folder, job.recall)),
-        ("PCA, sample", store.fit, (folder, job.dims, False)),
-        ("PCA, all rows", store.fit, (folder, job.dims, True)),
-        ("project", store.project, (folder, job.dims)),
-        ("recalls", store.recalls, (folder, job.dims, job.recall)),
+        ("write", store_size.write, (folder, rows, job.queries, dim, job.stored)),
+        ("read", store_size.read, (folder,)),
+        ("exact search", store_size.find, (folder, job.recall)),
+        ("PCA, sample", store_size.fit, (folder, job.dims, False)),
+        ("PCA, all rows", store_size.fit, (folder, job.dims, True)),
+        ("project", store_size.project, (folder, job.dims)),
+        ("recalls", store_size.recalls, (folder, job.dims, job.recall)),
     ]
 
 

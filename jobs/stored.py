@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 from jobs.cli import parse, run_job
-from shards.errors import UsageError
+from pipeline.common.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ def main() -> None:
     if any(number < 1 for number in (*job.dimensions, *job.recalls)):
         raise UsageError("--dimensions and --recalls start at 1")
     from pipeline.config import EvaluationConfig, to_dict
-    from pipeline.evaluation import tables
-    from pipeline.evaluation.datasets import load_sets
+    from pipeline.evaluation.describe.stored import evaluate_stores, stored_sets
     from pipeline.evaluation.predictions import save_results
-    from pipeline.evaluation.stored import evaluate_stores, stored_sets
+    from pipeline.evaluation.report import tables
+    from pipeline.evaluation.sets.load import load_sets
 
     shared = {f.name for f in dataclasses.fields(EvaluationConfig)} & {f.name for f in dataclasses.fields(StoredJob)}
     config = EvaluationConfig(**{name: getattr(job, name) for name in shared})

@@ -1,7 +1,7 @@
 """Train one run, or continue it: accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.train --config FILE
 
 Also runs without the launcher, in one process: `python -m jobs.train --config FILE --data.places_per_batch 16`.
-The same command continues a run that was killed. `--dry-run` prints the plan and exits. Exit codes: `shards.errors`;
+The same command continues a run that was killed. `--dry-run` prints the plan and exits. Exit codes: `common.errors`;
 note that `accelerate launch` itself turns any of them but 0 into 1, so `<run>/status.json` tells them too.
 """
 
@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jobs.cli import parse, run_job
+from pipeline.common.errors import UserError
 from pipeline.config import RunConfig, to_dict
-from shards.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def main() -> None:
 
             print(yaml.safe_dump(to_dict(config), sort_keys=False), flush=True)
         if job.dry_run:
-            from pipeline.training.preview import preview, show
+            from pipeline.training.dry_run import preview, show
 
             if first:
                 print(show(preview(config)))

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from jobs.cli import parse, run_job
+from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig
-from shards.errors import UsageError
 
 if TYPE_CHECKING:
     from pipeline.model.vpr import PlaceModel
@@ -63,25 +63,25 @@ def main() -> None:
         raise UsageError(f"--to {job.to}: the ending decides what is written; give one of {', '.join(ENDINGS)}")
     if target is not None and target.exists() and target.resolve() == Path(job.source).expanduser().resolve():
         raise UsageError(f"--to {job.to} is the source itself; give another file")
-    from pipeline.model import exchange
+    from pipeline.model.weights import convert
 
-    found = exchange.kind_of(job.source)
+    found = convert.kind_of(job.source)
     kind = found if job.kind == "auto" else job.kind
     if kind == "model" and found != "model":
-        raise UsageError(f"{job.source}: not {exchange.KINDS['model']} but {exchange.KINDS[found]}")
+        raise UsageError(f"{job.source}: not {convert.KINDS['model']} but {convert.KINDS[found]}")
     if kind == "backbone" and not job.variant:
-        _backbone(job, target, exchange.KINDS[found])
+        _backbone(job, target, convert.KINDS[found])
         return
     if kind == "backbone":
         from pipeline.model.variants import variant
 
         config = variant(job.variant, job.model)
-        backbone = exchange.fitting_backbone(job.source, config.backbone)
+        backbone = convert.fitting_backbone(job.source, config.backbone)
         config = dataclasses.replace(config, backbone=backbone)
-        model = exchange.around_backbone(job.source, config, job.image_size)
+        model = convert.around_backbone(job.source, config, job.image_size)
     else:
-        model = exchange.read_model(job.source, kind, job.model, job.image_size)
-    print(f"{job.source}: {exchange.KINDS[kind if found == 'unpooled' else found]}")
+        model = convert.read_model(job.source, kind, job.model, job.image_size)
+    print(f"{job.source}: {convert.KINDS[kind if found == 'unpooled' else found]}")
     _describe(model)
     if target is not None:
         _write(model, target, job)
@@ -89,15 +89,15 @@ def main() -> None:
 
 def _backbone(job: WeightsJob, target: Path | None, what: str) -> None:
     """Tells what backbone it is, and writes it under the release's names."""
-    from pipeline.model import exchange
+    from pipeline.model.weights import convert
 
-    config = exchange.fitting_backbone(job.source, job.model.backbone)
+    config = convert.fitting_backbone(job.source, job.model.backbone)
     print(f"{job.source}: {what}; its backbone is {config.name}")
     if target is None:
         return
     if target.suffix != ".safetensors":
         raise UsageError(f"--to {job.to}: a backbone alone is written as .safetensors; --variant NAME makes it a model")
-    tensors = exchange.write_backbone(job.source, config, target)
+    tensors = convert.write_backbone(job.source, config, target)
     numbers = sum(tensor.numel() for tensor in tensors.values())
     print(f"  {len(tensors)} tensors, {numbers:,} numbers, read back and equal")
     _wrote(target, f"use it as --model.backbone.name {config.name} --model.backbone.weights {target}")
@@ -112,19 +112,19 @@ def _describe(model: PlaceModel) -> None:
 
 
 def _write(model: PlaceModel, target: Path, job: WeightsJob) -> None:
-    from pipeline.model import exchange
+    from pipeline.model.weights import convert
 
     if target.suffix == ".onnx":
-        from pipeline.model.onnx_export import export_onnx
+        from pipeline.model.weights.onnx_export import export_onnx
 
         difference = export_onnx(model, target, job.onnx)
         print(f"  onnxruntime against torch, 1 and 3 images: largest difference {difference:.1e}")
         _wrote(target, f"input 'images' [batch, 3, {model.image_size}, {model.image_size}], output '{job.onnx}'")
     elif target.suffix == ".pth":
-        exchange.write_published(model, target)
+        convert.write_published(model, target)
         _wrote(target, "published names, tensors alone")
     else:
-        exchange.write_model(model, target, job.source)
+        convert.write_model(model, target, job.source)
         _wrote(target, f"load_model('{target}'), or --checkpoint {target} in jobs.evaluate")
 
 

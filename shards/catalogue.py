@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from shards.errors import DataError
+from pipeline.common.errors import DataError
 
 SCHEMA = pa.schema(
     [

@@ -21,11 +21,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from pipeline.common.files import sync_path, write_atomically
 from shards import index
 from shards.catalogue import Catalogue, LeftOut, runs
 from shards.images import ImageRule, Refused, admit
 from shards.rounds import IMAGES_A_PLACE, draw, permutation, rank
-from shards.shard_file import Member, ShardFile, sync_path, write_atomically
+from shards.shard_file import Member, ShardFile
 
 PART_SCHEMA = pa.schema(
     [("number", pa.int64()), ("good", pa.int32()), *(f for f in index.SCHEMA if f.name != "place")]

@@ -19,8 +19,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shards.errors import DataError
-from shards.progress import track
+from pipeline.common.errors import DataError
+from pipeline.common.progress import track
 
 FORMAT_VERSION = 1
 IMAGES_A_SAMPLE = 4

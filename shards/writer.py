@@ -26,13 +26,13 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from pipeline.common.errors import DataError, UsageError
+from pipeline.common.files import write_atomically
+from pipeline.common.progress import Progress
 from shards import groups, index, report
 from shards.catalogue import Catalogue, LeftOut
-from shards.errors import DataError, UsageError
 from shards.images import QUALITY, ImageRule
-from shards.progress import Progress
 from shards.rounds import IMAGES_A_PLACE, shown
-from shards.shard_file import write_atomically
 
 SETTINGS = "settings.json"
 MAX_ROUNDS = 128  # as many files are open at once in each worker

@@ -20,7 +20,7 @@ ALLOWED = {
     },
     "pipeline.training": {"shards", "pipeline"},
     "pipeline.benchmark": {"shards", "pipeline"},
-    "pipeline.experiments": {"shards", "pipeline"},
+    "pipeline.paper": {"shards", "pipeline"},
     "pipeline": set(),
     "jobs": {"shards", "pipeline", "jobs"},
 }  # fmt: skip

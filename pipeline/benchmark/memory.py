@@ -20,7 +20,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from pipeline.benchmark.alone import alone, peak
+from pipeline.benchmark.own_process import alone, peak
 from pipeline.benchmark.sizes import SIZES, Norm, Size, bare, batch, build
 from pipeline.benchmark.timing import table
 from pipeline.model.vpr import PlaceModel

@@ -19,7 +19,7 @@ from torch import Tensor
 from pipeline.benchmark.sizes import VIEWS, Size
 from pipeline.benchmark.timing import Comparison, clock, from_seconds
 from pipeline.distributed import gather, rank_slice, world_size
-from pipeline.model.backbone import sizes
+from pipeline.model.backbones.transformer import sizes
 from pipeline.model.cross_image import CrossImageEncoder
 from pipeline.training.loss import MultiSimilarityLoss
 

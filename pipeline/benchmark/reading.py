@@ -26,7 +26,7 @@ from pipeline.data.augment import Augment, Draws, training_view
 from pipeline.data.images import decode, shrink
 from pipeline.data.places import Places, build_loader, members
 from shards.index import ShardIndex, read_index
-from shards.sources import read_source
+from shards.sources.registry import read_source
 from shards.writer import WriteRule, write_shards
 
 VIEWS, PLACES_A_BATCH = 4, 4

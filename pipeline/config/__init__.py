@@ -12,12 +12,12 @@ import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from pipeline.common.errors import UsageError
 from pipeline.config.model import AdapterConfig as AdapterConfig
 from pipeline.config.model import BackboneConfig as BackboneConfig
 from pipeline.config.model import CrossImageConfig as CrossImageConfig
 from pipeline.config.model import ModelConfig as ModelConfig
 from pipeline.config.model import PoolingConfig as PoolingConfig
-from shards.errors import UsageError
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageEnhance, ImageOps
 
+from pipeline.common.errors import UsageError
 from pipeline.data.images import shrink
-from shards.errors import UsageError
 
 Augment = Literal["rand", "light", "off"]
 MAGNITUDES = 30

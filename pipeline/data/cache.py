@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from shards.errors import DataError, UsageError
+from pipeline.common.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from shards.index import ShardIndex

@@ -23,7 +23,7 @@ from PIL import Image, ImageOps
 from torch import Tensor
 from torch.nn import functional as F
 
-from shards.errors import DataError
+from pipeline.common.errors import DataError
 
 try:
     import simplejpeg

@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from pipeline.common.errors import DataError, UsageError, UserError
 from pipeline.config import DataConfig
 from pipeline.data import workers
-from pipeline.data.ahead import FetchAhead
 from pipeline.data.augment import Draws, check, training_view
 from pipeline.data.cache import ShardCache
 from pipeline.data.images import decode
 from pipeline.data.plan import EpochPlan, Rows, plan
-from shards.errors import DataError, UsageError, UserError
+from pipeline.data.prefetch import FetchAhead
 
 if TYPE_CHECKING:
     from shards.index import ShardIndex

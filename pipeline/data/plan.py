@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from shards.errors import DataError, UsageError
+from pipeline.common.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from shards.index import ShardIndex

@@ -19,14 +19,11 @@ import torch
 from torch import nn
 
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.descriptors import evaluating
-from pipeline.evaluation.engine import Engine, on_rank_0
-from pipeline.evaluation.evaluation_set import EvaluationSet
-from pipeline.evaluation.projection import Projection, fit_rows, load_projection, projected, sample_rows
+from pipeline.evaluation.describe.encode import evaluating
+from pipeline.evaluation.describe.sides import Engine, on_rank_0
 from pipeline.evaluation.protocol import Protocol, Side, protocols
 from pipeline.evaluation.recall import recall_at
-from pipeline.evaluation.rerank import PatchTokens, rerank
-from pipeline.evaluation.retrieval import (
+from pipeline.evaluation.search.exact import (
     Blocks,
     agreement,
     batches,
@@ -36,6 +33,9 @@ from pipeline.evaluation.retrieval import (
     search_index,
     search_within,
 )
+from pipeline.evaluation.search.projection import Projection, fit_rows, load_projection, projected, sample_rows
+from pipeline.evaluation.search.rerank import PatchTokens, rerank
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 SIDES: tuple[Side, Side] = ("database", "queries")
 

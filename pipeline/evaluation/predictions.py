@@ -18,13 +18,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.evaluation import tables
+from pipeline.common.errors import DataError
 from pipeline.evaluation.evaluate import Result
-from pipeline.evaluation.evaluation_set import EvaluationSet
-from pipeline.evaluation.msls import export_predictions
 from pipeline.evaluation.protocol import Protocol
 from pipeline.evaluation.recall import first_hits
-from shards.errors import DataError
+from pipeline.evaluation.report import tables
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
+from pipeline.evaluation.sets.msls import export_predictions
 
 META = b"place_recognition"
 

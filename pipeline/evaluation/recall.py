@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shards.errors import DataError, UsageError
+from pipeline.common.errors import DataError, UsageError
 
 
 def first_hits(predictions: ArrayLike, positives: Sequence[ArrayLike]) -> np.ndarray:

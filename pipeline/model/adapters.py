@@ -12,9 +12,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from pipeline.common.errors import UsageError
 from pipeline.config import AdapterConfig
 from pipeline.model.batch_norm import GlobalBatchNorm2d
-from shards.errors import UsageError
 
 NORM_EPS = 1e-3  # published: BatchNorm2d(eps=0.001)
 

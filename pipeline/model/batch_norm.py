@@ -25,7 +25,7 @@ class GlobalBatchNorm2d(nn.BatchNorm2d):
 
     Under `torch.utils.checkpoint` the second forward, inside backward, recomputes the same output but leaves the
     running buffers alone: they move once a step. Chunks of the batch would each be normalised by themselves, so
-    `PlaceModel.encode` takes its chunks through the blocks in step (pipeline.model.lockstep).
+    `PlaceModel.encode` takes its chunks through the blocks in step (pipeline.model.chunked).
     """
 
     def forward(self, input: Tensor) -> Tensor:

@@ -11,9 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pipeline.common.errors import UsageError
 from pipeline.config import CrossImageConfig
 from pipeline.distributed import gather
-from shards.errors import UsageError
 
 
 class CrossImageAttention(nn.Module):

@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pipeline.common.errors import UsageError
 from pipeline.config import PoolingConfig
-from shards.errors import UsageError
 
 
 def cell_edges(grid: int, cells: int) -> list[int]:

@@ -11,8 +11,8 @@ import dataclasses
 import difflib
 from typing import Any
 
+from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig
-from shards.errors import UsageError
 
 NO_CRICA: dict[str, Any] = {"cross_image.layers": 0}
 FROZEN: dict[str, Any] = {"adapter.kind": "none", "train": "frozen"}

@@ -11,16 +11,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig
 from pipeline.model.aggregators import build_pooling
-from pipeline.model.backbone import Backbone
+from pipeline.model.backbones.resnet import ResNet, is_resnet
+from pipeline.model.backbones.transformer import Backbone
+from pipeline.model.backbones.vgg import VGG
 from pipeline.model.batch_norm import GlobalBatchNorm2d
+from pipeline.model.chunked import in_step, recomputed
 from pipeline.model.cross_image import CrossImageEncoder
-from pipeline.model.lockstep import in_step, recomputed
 from pipeline.model.pooling import at_least_float32
-from pipeline.model.resnet import ResNet, is_resnet
-from pipeline.model.vgg import VGG
-from shards.errors import UsageError
 
 
 class PlaceModel(nn.Module):
@@ -54,7 +54,7 @@ class PlaceModel(nn.Module):
             images: float, ImageNet-normalised, S = `image_size`.
             chunk: images encoded at a time and recomputed in backward; the result is the same, to rounding. Each chunk
                 keeps its input alone, so peak memory depends on the chunk and not on b. With BatchNorm in training
-                the chunks go in step, block by block (pipeline.model.lockstep), so that it still sees the global
+                the chunks go in step, block by block (pipeline.model.chunked), so that it still sees the global
                 batch: then memory grows with b, though much less than without chunks.
 
         Raises:

@@ -22,9 +22,9 @@ from typing import Any
 
 from torch import Tensor
 
+from pipeline.common.errors import DataError, UsageError
+from pipeline.common.files import sync_path, usual_permissions
 from pipeline.config import RunConfig, flatten
-from shards.errors import DataError, UsageError
-from shards.shard_file import sync_path, usual_permissions
 
 # Settings a resumed run may change: they decide where, how long and how fast, never what a step computes.
 FREE = (
@@ -161,7 +161,7 @@ def find(run: Path, resume: str) -> Path | None:
 
 
 def read(path: Path) -> tuple[RunState, dict[str, Any], dict[str, Tensor]]:
-    """State, flat config and optimiser tensors of a checkpoint; its weights are read by `pipeline.model.weights`.
+    """State, flat config and optimiser tensors of a checkpoint; its weights are read by `pipeline.model.weights.files`.
 
     Raises:
         DataError: a file is missing or not what it should be.

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.common.errors import UsageError
 from pipeline.training.tracking import open_client
-from shards.errors import UsageError
 
 RECALL = re.compile(r"^(?P<kind>\w+)/(?P<set>.+)\.(?P<protocol>[^.]+)\.recall_at_(?P<k>\d+)$")
 # where runs are recorded, how often and how fast, not what they are

@@ -12,9 +12,9 @@ from contextlib import contextmanager, nullcontext
 
 import torch
 
+from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig
 from pipeline.model.vpr import PlaceModel
-from shards.errors import UsageError
 
 
 def compile_backbone(model: PlaceModel, config: RunConfig, engine: str, device: torch.device) -> None:

@@ -12,10 +12,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.model.backbone import Backbone
+from pipeline.common.errors import UsageError
+from pipeline.model.backbones.transformer import Backbone
 from pipeline.model.batch_norm import GlobalBatchNorm2d
 from pipeline.model.vpr import PlaceModel, parameter_counts
-from shards.errors import UsageError
 
 ROUNDS = {"all_gather": 1, "reduce_scatter": 1, "all_reduce": 2}
 

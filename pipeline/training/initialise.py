@@ -12,13 +12,13 @@ import sys
 import torch
 from torch import Tensor
 
+from pipeline.common.errors import UserError
 from pipeline.config import RunConfig
 from pipeline.data.images import normalise
 from pipeline.data.places import build_loader
 from pipeline.distributed import broadcast_object, rank
 from pipeline.model.aggregators.netvlad import NetVLAD
 from pipeline.model.vpr import PlaceModel
-from shards.errors import UserError
 from shards.index import ShardIndex
 
 

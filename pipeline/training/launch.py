@@ -20,8 +20,8 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
+from pipeline.common.errors import UsageError, UserError
 from pipeline.distributed import is_distributed
-from shards.errors import UsageError, UserError
 
 ADVICE = "launch with: accelerate launch --config_file jobs/accelerate/<engine>.yaml -m jobs.train --config FILE"
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import TypeVar
 
+from pipeline.common.progress import Progress
 from pipeline.training.checkpoint import RunState
-from shards.progress import Progress
 
 Item = TypeVar("Item")
 

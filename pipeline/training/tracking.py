@@ -19,8 +19,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig, flatten, to_dict
-from shards.errors import UsageError
 
 
 def store_uri(uri: str | None, output: str) -> str:

@@ -18,17 +18,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pipeline.common.errors import DataError, Diverged, Preempted, UsageError, UserError
 from pipeline.config import RunConfig, to_dict
 from pipeline.data.images import normalise
 from pipeline.data.places import Batch, build_loader
 from pipeline.data.plan import plan
 from pipeline.distributed import any_rank, barrier, broadcast_object, rank, world_size
 from pipeline.model.vpr import PlaceModel, build_model
-from pipeline.model.weights import frozen_hash, load_trainable, save_model, saved_names
+from pipeline.model.weights.files import frozen_hash, load_trainable, save_model, saved_names
 from pipeline.training import checkpoint
 from pipeline.training.checkpoint import RunState
 from pipeline.training.compiled import compile_backbone, uncompiled
-from pipeline.training.engine import Engine, build_engine, choose
+from pipeline.training.engines.base import Engine
+from pipeline.training.engines.build import build_engine, choose
 from pipeline.training.initialise import initialise
 from pipeline.training.launch import stop_signals
 from pipeline.training.loss import MultiSimilarityLoss
@@ -36,7 +38,6 @@ from pipeline.training.meter import Meter
 from pipeline.training.schedule import build_optimizer, learning_rate
 from pipeline.training.tracking import Tracker
 from pipeline.training.validation import Validation
-from shards.errors import DataError, Diverged, Preempted, UsageError, UserError
 from shards.index import read_index
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from torch import nn
 
+from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig
-from shards.errors import UsageError
 
 
 class Validation:
@@ -29,7 +29,7 @@ class Validation:
     """
 
     def __init__(self, config: RunConfig, device: Any) -> None:
-        from pipeline.evaluation.datasets import load_set
+        from pipeline.evaluation.sets.load import load_set
 
         if config.validate.rerank:
             raise UsageError(

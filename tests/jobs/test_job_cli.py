@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from jobs.cli import parse
+from pipeline.common.errors import UsageError
 from pipeline.config import EvaluationConfig, RunConfig
-from shards.errors import UsageError
 
 ROOT = Path(__file__).resolve().parents[2]
 JOBS = sorted(path.stem for path in (ROOT / "jobs").glob("*.py") if path.stem not in ("__init__", "cli"))

@@ -17,7 +17,7 @@ from PIL import Image
 
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, PoolingConfig
 from pipeline.model.vpr import build_model
-from pipeline.model.weights import save_model
+from pipeline.model.weights.files import save_model
 
 ROOT = Path(__file__).resolve().parents[2]
 

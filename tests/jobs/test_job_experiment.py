@@ -18,14 +18,14 @@ from job_process import JobProcess
 from PIL import Image
 from tiny import prepare, run_settings
 
+from pipeline.common.errors import UsageError
 from pipeline.config import CrossImageConfig, EvaluationConfig, ModelConfig, RunConfig, from_dict
 from pipeline.config.model import BackboneConfig
-from pipeline.evaluation import paper
-from pipeline.experiments import plan, report, study
-from pipeline.experiments.rows import TABLES, Row, table
-from pipeline.experiments.runner import Runner
+from pipeline.evaluation.report import paper_numbers
 from pipeline.model.variants import VARIANTS, variant
-from shards.errors import UsageError
+from pipeline.paper import plan, study, table_report
+from pipeline.paper.rows import TABLES, Row, table
+from pipeline.paper.runner import Runner
 
 ASKED = (
     "ablation_crica", "ablation_adaptation", "dimensions", "epochs", "encoder_layers", "train_batch",
@@ -96,9 +96,9 @@ def test_a_table_is_filled_continued_and_found_in_mlflow(root: Path) -> None:
     rows = list(csv.DictReader((root / "outputs/tables/inference_batch/table.csv").open()))
     ours = {(r["row"], r["protocol"], r["n"]): float(r["mean"]) for r in rows}
     assert {r["row"] for r in rows} == {"1", "4", "8", "16", "32"}
-    from pipeline.evaluation.datasets import load_set
     from pipeline.evaluation.evaluate import evaluate
-    from pipeline.model.weights import load_model
+    from pipeline.evaluation.sets.load import load_set
+    from pipeline.model.weights.files import load_model
 
     (run_folder,) = (root / "outputs").glob("CricaVPR-*-seed0")
     asked = EvaluationConfig(
@@ -117,14 +117,14 @@ def test_a_table_is_filled_continued_and_found_in_mlflow(root: Path) -> None:
     again = built(root, "inference_batch", resize="published")
     assert again.measured_speed() and [again.runner.status(each) for each in again.trainings] == ["to do"]
     again.fill(run=False)
-    assert report.markdown(again) == kept
+    assert table_report.markdown(again) == kept
 
 
 def test_every_table_asked_for_is_there_with_the_papers_rows() -> None:
     assert set(ASKED) <= set(TABLES)
     for name in ASKED:
         if name != "same_data":
-            assert list(TABLES[name].rows) == list(paper.TABLES[name][1])
+            assert list(TABLES[name].rows) == list(paper_numbers.TABLES[name][1])
         for row in TABLES[name].rows.values():
             assert row.variant in VARIANTS
     with pytest.raises(UsageError, match="did you mean 'kernels'"):
@@ -184,18 +184,18 @@ def test_same_settings_share_a_training_and_others_never_do() -> None:
 
 
 def test_values_show_mean_and_spread_over_seeds(root: Path) -> None:
-    one = report.Value((50.0, 54.0, 58.0))
+    one = table_report.Value((50.0, 54.0, 58.0))
     assert (one.mean, one.deviation, str(one)) == (54.0, pytest.approx(np.std([50, 54, 58], ddof=1)), "54.0 ±4.0")
-    assert str(report.Value((50.0,))) == "50.0"
+    assert str(table_report.Value((50.0,))) == "50.0"
     filled = built(root, "kernels", (0, 1))
     name = next(iter(filled.sets.values())).name
     filled.values["5x5", name, "ordered16"] = {1: [40.0, 44.0], 5: [80.0, 80.0]}
     filled.values["3x3", name, "ordered16"] = {1: [40.0], 5: [80.0]}
-    head, *rows = report.cells(filled, str(root / "evaluation"))
+    head, *rows = table_report.cells(filled, str(root / "evaluation"))
     assert head == ["row", "single", "shuffled16", "ordered16", "paper: pitts30k, ordered8"]
     assert rows[2] == ["5x5", "-", "-", "42.0 ±2.8 / 80.0 ±0.0", "94.7 / 97.3"]
     assert rows[1][3] == "40.0 / 80.0 (n 1)"
-    assert report.markdown(filled).count("\n| ") == len(["head", "rule", *rows])
+    assert table_report.markdown(filled).count("\n| ") == len(["head", "rule", *rows])
 
 
 def test_dry_run_tells_rows_trainings_cost_and_what_is_missing(root: Path) -> None:

@@ -14,14 +14,14 @@ from tiny import photo
 from tiny_checkpoint import save_tiny
 
 from jobs.locate import path_words
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
 from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.evaluate import model_fingerprint
-from pipeline.evaluation.locate import locate
-from pipeline.evaluation.photo_index import make_index, open_index
+from pipeline.locate.answers import locate
+from pipeline.locate.photo_index import make_index, open_index
 from pipeline.model.vpr import PlaceModel
-from pipeline.model.weights import load_model
-from shards.errors import DataError, UsageError
+from pipeline.model.weights.files import load_model
 
 CONFIG = EvaluationConfig(workers=0, batch=4)
 

@@ -17,13 +17,13 @@ from job_process import JobProcess
 from tiny import photo
 from tiny_checkpoint import save_tiny
 
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation import kept
-from pipeline.evaluation.locate import locate
-from pipeline.evaluation.photo_index import make_index, open_index
+from pipeline.locate import descriptor_cache
+from pipeline.locate.answers import locate
+from pipeline.locate.photo_index import make_index, open_index
 from pipeline.model.vpr import PlaceModel
-from pipeline.model.weights import load_model
-from shards.errors import DataError, UsageError
+from pipeline.model.weights.files import load_model
 
 CONFIG = EvaluationConfig(workers=0, batch=1)
 
@@ -145,7 +145,7 @@ def test_several_folders_and_a_manifest(model: PlaceModel, photos: Path, tmp_pat
 def test_killed_while_describing_the_old_index_answers_and_the_build_continues(
     run: Path, model: PlaceModel, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(kept, "PART_SECONDS", 0.0)  # a part a photo, as if each took half a minute
+    monkeypatch.setattr(descriptor_cache, "PART_SECONDS", 0.0)  # a part a photo, as if each took half a minute
     index = tmp_path / "index"
     finished(start(run, index, "--build", str(photos)))
     former = {f: f.read_bytes() for f in next(index.glob("index-*")).iterdir()}
@@ -175,7 +175,7 @@ def test_killed_while_describing_the_old_index_answers_and_the_build_continues(
 def test_killed_at_any_moment_it_is_the_old_index_or_the_new_one(
     run: Path, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(kept, "PART_SECONDS", 0.0)
+    monkeypatch.setattr(descriptor_cache, "PART_SECONDS", 0.0)
     index = tmp_path / "index"
     finished(start(run, index, "--build", str(photos)))
     fingerprint = json.loads((index / "about.json").read_text())["fingerprint"]

@@ -17,11 +17,11 @@ from releases_restated import SEQUENTIAL, filled, linear_shapes, resnet_shapes
 from tiny import make_evaluation, photo
 
 from jobs import figures, weights
+from pipeline.common.errors import UserError
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig
-from pipeline.model import exchange
 from pipeline.model.vpr import PlaceModel, build_model
-from pipeline.model.weights import load_model, save_model
-from shards.errors import UserError
+from pipeline.model.weights import convert
+from pipeline.model.weights.files import load_model, save_model
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ModelConfig(
@@ -56,7 +56,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 model.backbone.vit.embeddings.patch_embeddings.projection.weight.zero_()  # type: ignore[union-attr]
         best = folder / "outputs" / run / "checkpoints" / "best" / "model.safetensors"
         save_model(model, best, CONFIG, 56, everything=True)
-    exchange.write_published(model, folder / "plain.pth")
+    convert.write_published(model, folder / "plain.pth")
     state = torch.load(folder / "plain.pth", weights_only=True)
     torch.save({"model_state_dict": {f"module.{n}": t for n, t in state.items()}}, folder / "CricaVPR.pth")
     backbone = {n.removeprefix("backbone."): t for n, t in state.items() if n.startswith("backbone.")}

@@ -12,9 +12,9 @@ from releases_restated import SEQUENTIAL, filled, linear_shapes, resnet_shapes
 from tiny import make_evaluation
 
 from jobs import evaluate, weights
-from pipeline.model.releases import from_release
-from pipeline.model.weights import load_model
-from shards.errors import DataError, UsageError
+from pipeline.common.errors import DataError, UsageError
+from pipeline.model.weights.files import load_model
+from pipeline.model.weights.released import from_release
 
 BACKBONE = resnet_shapes([f"backbone.{part}" for part in SEQUENTIAL], (1, 1, 1, 1), width=8)
 COSPLACE = filled(BACKBONE | {"aggregation.1.p": (1,)} | linear_shapes("aggregation.3", 16, 256))

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from shards import gsv_cities
-from shards.errors import DataError, UsageError
-from shards.sources import SourceRule, detect, read_source
+from pipeline.common.errors import DataError, UsageError
+from shards.sources import gsv_cities
+from shards.sources.registry import SourceRule, detect, read_source
 
 HEADER = "place_id,year,month,northdeg,city_id,lat,lon,panoid\n"
 

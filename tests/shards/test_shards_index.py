@@ -11,9 +11,9 @@ from pathlib import Path
 import fsspec
 import pytest
 
+from pipeline.common.errors import DataError
 from shards import index
-from shards.errors import DataError
-from shards.sources import read_source
+from shards.sources.registry import read_source
 from shards.writer import WriteRule, write_shards
 
 

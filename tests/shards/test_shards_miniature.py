@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from shards.errors import DataError, UsageError
-from shards.miniature import MiniatureSummary, draw
-from shards.miniature.geodesy import band, to_degrees
-from shards.miniature.layout import plan_photos
-from shards.miniature.picture import Studio
+from pipeline.common.errors import DataError, UsageError
+from shards.sources.miniature import MiniatureSummary, draw
+from shards.sources.miniature.geodesy import band, to_degrees
+from shards.sources.miniature.layout import plan_photos
+from shards.sources.miniature.picture import Studio
 
 PLACES, VAL, TEST, SIZE = 16, 4, 6, (96, 72)
 COLUMNS = ["place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid"]
@@ -184,7 +184,7 @@ def test_photos_of_a_place_show_the_same_place() -> None:
 
 def test_the_camera_keeps_the_rules_of_perspective() -> None:
     """A wall's corners land where the pinhole equation puts them, on either side of a turn of the head."""
-    from shards.miniature.camera import Camera, Surface, lay
+    from shards.sources.miniature.camera import Camera, Surface, lay
 
     camera = Camera(1.0, 1.7, -2.0, 0.3, 200.0, 120.0, 0.0, 320, 240)
     wall = Surface((2.0, 5.0, 18.0), (6.0, 0.0, 0.0), (0.0, -5.0, 0.0))

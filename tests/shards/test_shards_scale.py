@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from shards import index
-from shards.gsv_cities import _read_frame
+from shards.sources.gsv_cities import _read_frame
 
 PLACES = 57_462  # with at least four images, of 59,342
 ROWS = 470_834

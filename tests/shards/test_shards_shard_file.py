@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import webdataset
 
-from shards.shard_file import ShardFile, write_atomically
+from pipeline.common.files import write_atomically
+from shards.shard_file import ShardFile
 
 SAMPLES = [
     (f"{n:06d}", {**{f"{k}.jpg": bytes([k, n]) * (n * 311 + k) for k in range(4)}, "json": b'{"n": %d}' % n})

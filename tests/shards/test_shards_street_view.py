@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from shards.errors import DataError, UsageError
-from shards.sources import SourceRule, detect, read_source
+from pipeline.common.errors import DataError, UsageError
+from shards.sources.registry import SourceRule, detect, read_source
 
 
 def put(root: Path, *paths: str, data: bytes = b"1") -> None:

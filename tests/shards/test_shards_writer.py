@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 import webdataset
 
+from pipeline.common.errors import DataError, UsageError
 from shards import index
-from shards.errors import DataError, UsageError
 from shards.images import ImageRule
 from shards.report import Summary
-from shards.sources import read_source
+from shards.sources.registry import read_source
 from shards.writer import WriteRule, remove_shards, write_shards
 
 Gsv = Callable[..., Path]

@@ -1,6 +1,7 @@
 """Other methods' released networks, restated: names and shapes of their state dicts, and their forward passes.
 
-Written from the public sources named in pipeline/model/layouts.py, in plain functional torch on a state dict; nothing
+Written from the public sources named in pipeline/model/weights/released_layouts.py, in plain functional torch
+on a state dict; nothing
 of the project is used, so that its conversions are compared with something else than themselves.
 """
 

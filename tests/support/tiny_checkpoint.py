@@ -8,7 +8,7 @@ import torch
 
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, PoolingConfig
 from pipeline.model.vpr import build_model
-from pipeline.model.weights import save_model
+from pipeline.model.weights.files import save_model
 
 
 def save_tiny(folder: Path, seed: int) -> Path:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from pipeline.common.errors import UsageError
 from pipeline.config.baselines import BoQConfig
-from shards.errors import UsageError
 
 
 class Block(nn.Module):

@@ -13,9 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from pipeline.common.errors import UsageError
 from pipeline.config.baselines import SALADConfig
 from pipeline.model.pooling import at_least_float32
-from shards.errors import UsageError
 
 
 def transport(scores: Tensor, dustbin: Tensor, iterations: int) -> Tensor:

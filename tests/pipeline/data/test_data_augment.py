@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.common.errors import UsageError
 from pipeline.data import augment
 from pipeline.data.augment import NAMED, Draws, check, rand_augment, training_view
 from pipeline.data.images import decode, shrink
-from shards.errors import UsageError
 
 Photo = Callable[..., bytes]
 SIZE = 224

@@ -22,11 +22,11 @@ import fsspec
 import numpy as np
 import pytest
 
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import DataConfig
-from pipeline.data.ahead import FetchAhead
 from pipeline.data.cache import ShardCache
 from pipeline.data.places import build_loader
-from shards.errors import DataError, UsageError
+from pipeline.data.prefetch import FetchAhead
 from shards.index import ShardIndex
 
 Make = Callable[..., ShardIndex]

@@ -11,9 +11,9 @@ import pytest
 import torch
 from PIL import Image
 
+from pipeline.common.errors import DataError
 from pipeline.data import images
 from pipeline.data.images import MEAN, STD, decode, load_image, normalise, shrink, to_input
-from shards.errors import DataError
 
 Photo = Callable[..., bytes]
 

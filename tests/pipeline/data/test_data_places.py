@@ -21,13 +21,13 @@ import pytest
 import torch
 from PIL import Image
 
+from pipeline.common.errors import DataError
 from pipeline.config import DataConfig
 from pipeline.data.images import decode, shrink
 from pipeline.data.places import Batch, Places, build_loader, members
 from pipeline.data.plan import plan
-from shards.errors import DataError
 from shards.index import ShardIndex, read_index
-from shards.street_view import read_folders
+from shards.sources.street_view import read_folders
 from shards.writer import WriteRule, write_shards
 
 Make = Callable[..., ShardIndex]

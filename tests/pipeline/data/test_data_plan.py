@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import DataConfig
 from pipeline.data.places import build_loader
 from pipeline.data.plan import Order, plan
-from shards.errors import DataError, UsageError
 from shards.index import ShardIndex
 
 Make = Callable[..., ShardIndex]

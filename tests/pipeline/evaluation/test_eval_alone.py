@@ -19,12 +19,12 @@ from pipeline.config import (
     PoolingConfig,
 )
 from pipeline.data.images import load_image, normalise, to_input
-from pipeline.evaluation import descriptors
-from pipeline.evaluation.descriptors import calls_of
-from pipeline.evaluation.engine import Engine
+from pipeline.evaluation.describe import encode
+from pipeline.evaluation.describe.encode import calls_of
+from pipeline.evaluation.describe.sides import Engine
 from pipeline.evaluation.evaluate import evaluating
-from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.protocol import protocols
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.model.vpr import PlaceModel, build_model
 
 
@@ -51,7 +51,7 @@ def photos(tmp_path: Path) -> EvaluationSet:
 
 
 def described(photos: EvaluationSet) -> np.ndarray:
-    descriptors.ALONE = 4  # several calls, the last one short
+    encode.ALONE = 4  # several calls, the last one short
     built, config = model(), EvaluationConfig(groups=("single",), workers=0, batch=5)
     protocol = protocols(config, 28, "pairs")[0]
     with evaluating(built):
@@ -68,7 +68,7 @@ def described(photos: EvaluationSet) -> np.ndarray:
 def test_equal_to_each_image_by_itself_on_any_number_of_processes(
     photos: EvaluationSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(descriptors, "ALONE", 4)
+    monkeypatch.setattr(encode, "ALONE", 4)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     together, built = described(photos), model().eval()

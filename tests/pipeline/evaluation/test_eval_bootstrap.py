@@ -12,11 +12,18 @@ import pytest
 from job_process import JobProcess
 
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.bootstrap import as_text, compare_folders, differences, mcnemar, paired_interval, write_csv
 from pipeline.evaluation.evaluate import score
-from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.predictions import Predictions, load_predictions, save_predictions
 from pipeline.evaluation.protocol import protocols
+from pipeline.evaluation.report.significance import (
+    as_text,
+    compare_folders,
+    differences,
+    mcnemar,
+    paired_interval,
+    write_csv,
+)
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 CONFIG = EvaluationConfig(recalls=(1, 5), groups=("single",))
 

@@ -16,11 +16,11 @@ import pytest
 from PIL import Image
 
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation import figures, report
-from pipeline.evaluation.error_plots import areas
 from pipeline.evaluation.evaluate import score
-from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.protocol import protocols
+from pipeline.evaluation.report import figures, html
+from pipeline.evaluation.report.error_plots import areas
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 QUIET = (
@@ -84,9 +84,9 @@ def test_the_report_is_seen_whole_and_asks_nobody(tmp_path: Path) -> None:
     street = EvaluationSet("street", photos, photos[:4], positives, "pairs")
     rows, far = np.array([[0, 1], [1, 2], [3, 2], [4, 5]]), np.ones((4, 2), np.float32)
     result = score(street, protocols(config, 224, "pairs")[0], config, rows, far)
-    pictures = report.draw([result], [street], tmp_path / "figures")
-    page = tmp_path / "report.html"
-    report.write_report([result], pictures, page, "Street", {"checkpoint": "none"})
+    pictures = html.draw([result], [street], tmp_path / "figures")
+    page = tmp_path / "html.html"
+    html.write_report([result], pictures, page, "Street", {"checkpoint": "none"})
     seen, heard = visit(page, tmp_path)
     assert heard == []
     assert share(seen, "#1428dc") > 0.02 and min(share(seen, c) for c in (figures.GREEN, figures.RED)) > 0.0005

@@ -11,10 +11,10 @@ import torch
 from PIL import Image
 from torch import Tensor, nn
 
+from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation import descriptors
-from pipeline.evaluation.descriptors import Regions, blocks_of, encode, evaluating
-from shards.errors import DataError
+from pipeline.evaluation.describe import encode as encoding
+from pipeline.evaluation.describe.encode import Regions, blocks_of, encode, evaluating
 
 
 class Means(nn.Module):
@@ -65,7 +65,7 @@ def test_a_killed_encoding_continues_from_its_file(tmp_path: Path, monkeypatch: 
     with evaluating(model):
         whole = encode(model, paths, [blocks], CONFIG, cpu, progress=False)
         assert not isinstance(whole.values, np.memmap)
-        monkeypatch.setattr(descriptors, "REGIONS_IN_MEMORY", 0)
+        monkeypatch.setattr(encoding, "REGIONS_IN_MEMORY", 0)
         content = paths[280].read_bytes()
         paths[280].write_bytes(b"broken")  # ends the first attempt at batch 70, behind the mark of 64
         with pytest.raises(DataError, match=r"280\.png"):

@@ -14,13 +14,13 @@ import torch.multiprocessing as mp
 from PIL import Image
 from torch import Tensor, nn
 
+from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
 from pipeline.data.images import load_image, normalise, to_input
+from pipeline.evaluation.describe.stored import evaluate_stores
 from pipeline.evaluation.evaluate import Result, evaluate, fit_projections
-from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.protocol import protocols
-from pipeline.evaluation.stored import evaluate_stores
-from shards.errors import DataError
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 
 class Tiny(nn.Module):

@@ -12,15 +12,15 @@ from PIL import Image
 from tiny import photo
 from tiny_checkpoint import save_tiny
 
+from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.gps import gps_position
-from pipeline.evaluation.locate import locate
-from pipeline.evaluation.photo_index import make_index, open_index
-from pipeline.evaluation.photos import find_photos
-from pipeline.evaluation.utm import metres_between
+from pipeline.evaluation.sets.utm import metres_between
+from pipeline.locate.answers import locate
+from pipeline.locate.gps import gps_position
+from pipeline.locate.photo_index import make_index, open_index
+from pipeline.locate.photos import find_photos
 from pipeline.model.vpr import PlaceModel
-from pipeline.model.weights import load_model
-from shards.errors import DataError
+from pipeline.model.weights.files import load_model
 
 CONFIG = EvaluationConfig(workers=0, batch=1)
 CN_TOWER = ("N", (43, 38, 33.24), "W", (79, 23, 13.7))  # zone 17, 630084 m east, 4833438 m north (Wikipedia, UTM)

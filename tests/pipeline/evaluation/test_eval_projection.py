@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.evaluation.projection import fit_rows, load_projection, projected, sample_rows
-from pipeline.evaluation.retrieval import slices
-from shards.errors import DataError, UsageError
+from pipeline.common.errors import DataError, UsageError
+from pipeline.evaluation.search.exact import slices
+from pipeline.evaluation.search.projection import fit_rows, load_projection, projected, sample_rows
 
 
 def data(n: int, dim: int) -> np.ndarray:

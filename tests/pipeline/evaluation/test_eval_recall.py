@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.evaluation.ground_truth import within_radius
+from pipeline.common.errors import DataError, UsageError
 from pipeline.evaluation.recall import first_hits, recall_at
-from pipeline.evaluation.utm import file_positions
-from shards.errors import DataError, UsageError
+from pipeline.evaluation.sets.ground_truth import within_radius
+from pipeline.evaluation.sets.utm import file_positions
 
 
 def read_predictions(path: Path) -> tuple[list[dict], str]:

@@ -11,15 +11,15 @@ import torch
 from PIL import Image
 from processes import run_ranks
 
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig, ModelConfig, RunConfig
 from pipeline.config.baselines import ResNetConfig
 from pipeline.config.model import AdapterConfig, BackboneConfig, CrossImageConfig
 from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.evaluation_set import EvaluationSet
-from pipeline.evaluation.rerank import PatchTokens, inliers, mutual_matches, rerank
+from pipeline.evaluation.search.rerank import PatchTokens, inliers, mutual_matches, rerank
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.training.validation import Validation
-from shards.errors import DataError, UsageError
 
 
 def test_matches_are_mutual_and_nearest() -> None:

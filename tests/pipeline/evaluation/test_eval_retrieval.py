@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.common.errors import DataError
 from pipeline.evaluation.recall import recall_at
-from pipeline.evaluation.retrieval import (
+from pipeline.evaluation.search.exact import (
     agreement,
     build_index,
     index_bytes,
@@ -20,7 +21,6 @@ from pipeline.evaluation.retrieval import (
     search_within,
     slices,
 )
-from shards.errors import DataError
 
 
 def descriptors(n: int, dim: int = 16, seed: int = 0, clusters: int = 20) -> np.ndarray:

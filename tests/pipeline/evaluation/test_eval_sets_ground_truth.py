@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.evaluation import ground_truth
-from pipeline.evaluation.ground_truth import paired, within_frames, within_radius
-from pipeline.evaluation.layouts import by_frame
-from pipeline.evaluation.npy_lists import read_indices, read_ragged, read_strings
-from shards.errors import DataError
+from pipeline.common.errors import DataError
+from pipeline.evaluation.sets import ground_truth
+from pipeline.evaluation.sets.ground_truth import paired, within_frames, within_radius
+from pipeline.evaluation.sets.layouts import by_frame
+from pipeline.evaluation.sets.npy_lists import read_indices, read_ragged, read_strings
 
 
 def brute_force(database: np.ndarray, queries: np.ndarray, radius: float) -> list[list[int]]:

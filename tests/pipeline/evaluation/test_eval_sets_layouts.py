@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.datasets import available, load_set
-from pipeline.evaluation.evaluation_set import EvaluationSet, list_images
-from pipeline.evaluation.published import SETS, published_name
-from shards.errors import DataError, UsageError
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet, list_images
+from pipeline.evaluation.sets.load import available, load_set
+from pipeline.evaluation.sets.registry import SETS, published_name
 
 
 def touch(folder: Path, names: Iterable[str]) -> None:
@@ -218,7 +218,7 @@ def test_sets_are_read_without_torch(tmp_path: Path) -> None:
     import subprocess
     import sys
 
-    code = "import sys, pipeline.evaluation.datasets as d; d.available('.'); sys.exit('torch' in sys.modules)"
+    code = "import sys, pipeline.evaluation.sets.load as d; d.available('.'); sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[3])
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.datasets import load_set
-from pipeline.evaluation.evaluation_set import EvaluationSet
-from shards.errors import DataError
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
+from pipeline.evaluation.sets.load import load_set
 
 PHOTOS = ["d/z.jpg", "d/a.png", "d/m.jpg", "q/1.jpg", "q/2.jpg"]
 ROLES = ["database", "database", "database", "query", "query"]

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.datasets import load_set
-from pipeline.evaluation.msls import export_predictions, read_predictions
 from pipeline.evaluation.recall import recall_at
-from shards.errors import DataError
+from pipeline.evaluation.sets.load import load_set
+from pipeline.evaluation.sets.msls import export_predictions, read_predictions
 
 CITIES = {"cph": (347_000.0, 6_172_000.0), "sf": (551_000.0, 4_180_000.0)}
 

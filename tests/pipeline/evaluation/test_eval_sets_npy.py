@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.datasets import load_set
-from pipeline.evaluation.npy_lists import read_indices, read_ragged, read_strings
-from shards.errors import DataError, UsageError
+from pipeline.evaluation.sets.load import load_set
+from pipeline.evaluation.sets.npy_lists import read_indices, read_ragged, read_strings
 
 
 def ragged(rows: list[list[int]], dtype: str = "int64") -> np.ndarray:

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.evaluation.utm import file_position, file_positions, to_utm, utm_zone
-from shards.errors import DataError
+from pipeline.common.errors import DataError
+from pipeline.evaluation.sets.utm import file_position, file_positions, to_utm, utm_zone
 
 
 def test_names_are_read_as_common_evaluators_read_them() -> None:

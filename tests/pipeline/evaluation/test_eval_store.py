@@ -12,11 +12,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.descriptors import blocks_of
+from pipeline.evaluation.describe.encode import blocks_of
+from pipeline.evaluation.describe.store import DescriptorStore, StoreKey, StoreWriter, files_digest
 from pipeline.evaluation.protocol import protocols
-from pipeline.evaluation.store import DescriptorStore, StoreKey, StoreWriter, files_digest
-from shards.errors import DataError
 
 PROTOCOL = protocols(EvaluationConfig(group_size=4, groups=("shuffled",), pca=8), 64, "25 m")[0].grouping
 KEY = StoreKey("city", "database", "abcd", "files", PROTOCOL)

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.benchmark.alone import alone
-from pipeline.benchmark.store import Numbered, find, fit, project, protocol, read, recalls, write
+from pipeline.benchmark.own_process import alone
+from pipeline.benchmark.store_size import Numbered, find, fit, project, protocol, read, recalls, write
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation import retrieval
+from pipeline.evaluation.describe.store import DescriptorStore
+from pipeline.evaluation.describe.stored import evaluate_stores
 from pipeline.evaluation.evaluate import answer_queries
-from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.predictions import load_predictions, save_predictions
-from pipeline.evaluation.store import DescriptorStore
-from pipeline.evaluation.stored import evaluate_stores
+from pipeline.evaluation.search import exact
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 CONFIG = EvaluationConfig(recalls=(1, 4), groups=("single",))
 
@@ -29,7 +29,7 @@ def test_queries_in_batches_are_answered_as_all_at_once(monkeypatch: pytest.Monk
     shuffled = rng.permutation(90)  # a store of shuffled groups gives its rows in any order
     numbers = [shuffled[first : first + 7] for first in range(0, 90, 7)]
     described = {
-        "database": lambda: retrieval.slices(database, 64),
+        "database": lambda: exact.slices(database, 64),
         "queries": lambda: ((part, queries[part]) for part in numbers),
     }
     part, of_query = np.arange(300) % 3, np.arange(90) % 3
@@ -41,8 +41,8 @@ def test_queries_in_batches_are_answered_as_all_at_once(monkeypatch: pytest.Monk
     far = np.square(queries[:, None].astype(np.float64) - database[None]).sum(-1)
     far[(part[None] != of_query[:, None]) & (search == "parts")] = np.inf
     whole = answer_queries(evaluated, used, CONFIG, described)  # type: ignore[arg-type]
-    monkeypatch.setattr(retrieval, "QUERY_BYTES", 600)  # 14 queries at a time
-    assert [len(rows) for rows, _ in retrieval.batches(described["queries"])] == [14] * 6 + [6]  # type: ignore[arg-type]
+    monkeypatch.setattr(exact, "QUERY_BYTES", 600)  # 14 queries at a time
+    assert [len(rows) for rows, _ in exact.batches(described["queries"])] == [14] * 6 + [6]  # type: ignore[arg-type]
     rows, distances, remarks = answer_queries(evaluated, used, CONFIG, described)  # type: ignore[arg-type]
     if search != "hnsw":
         assert (rows == np.argsort(far, 1)[:, :4]).all()
@@ -101,9 +101,9 @@ def test_an_opened_index_stays_on_the_disk(tmp_path: Path, kind: str) -> None:
     """The kernel has the file's vectors mapped, all of them, and they answer."""
     vectors = np.random.Generator(np.random.PCG64(0)).random((500, 2_000), np.float32) + 1
     vectors[:3] = np.eye(3, 2_000)
-    retrieval.save_index(retrieval.build_index(partial(retrieval.slices, vectors), kind), tmp_path / "index")
-    index = retrieval.load_index(tmp_path / "index")
+    exact.save_index(exact.build_index(partial(exact.slices, vectors), kind), tmp_path / "index")
+    index = exact.load_index(tmp_path / "index")
     mapped = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if str(tmp_path) in line]
     bounds = [[int(end, 16) for end in fields[0].split("-")] for fields in mapped]
     assert sum(end - start for start, end in bounds) >= vectors.nbytes
-    assert retrieval.search_index(index, np.eye(3, 2_000, dtype=np.float32), 1)[1][:, 0].tolist() == [0, 1, 2]
+    assert exact.search_index(index, np.eye(3, 2_000, dtype=np.float32), 1)[1][:, 0].tolist() == [0, 1, 2]

@@ -12,14 +12,14 @@ import pytest
 import torch
 from PIL import Image
 
+from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation import figures, report, tables
 from pipeline.evaluation.evaluate import Result, score
-from pipeline.evaluation.evaluation_set import EvaluationSet
 from pipeline.evaluation.predictions import load_predictions, save_predictions
 from pipeline.evaluation.protocol import protocols
 from pipeline.evaluation.recall import recall_at
-from shards.errors import DataError
+from pipeline.evaluation.report import figures, html, tables
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 CONFIG = EvaluationConfig(recalls=(1, 5, 10), group_size=8)
 
@@ -157,15 +157,15 @@ def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
     sets = [street, sequence, unscored]
     results = [result for evaluated in sets for result in results_of(evaluated, config)]
     assert results[2].recalls == {}
-    pictures = report.draw(results, sets, tmp_path / "figures", Corner())
+    pictures = html.draw(results, sets, tmp_path / "figures", Corner())
     drawn = {p.path.name for p in pictures}
     assert drawn >= {"pitts30k.curves.png", "seq.single.errors.png", "seq.single.worst.jpg", "seq.attention.jpg"}
     assert {name for name in drawn if name.startswith("unknown")} == {
         "unknown.single.answers.jpg",
         "unknown.attention.jpg",
     }
-    report.write_report(results, pictures, tmp_path / "report.html", "A <test>", {"checkpoint": "a&b"})
-    page = (tmp_path / "report.html").read_text()
+    html.write_report(results, pictures, tmp_path / "html.html", "A <test>", {"checkpoint": "a&b"})
+    page = (tmp_path / "html.html").read_text()
     assert page.count("<img") == len(pictures) == page.count("base64,")
     assert not re.search(r'(?:src|href)="(?!data:|#)', page) and "<script" not in page and "url(" not in page
     assert "A &lt;test&gt;" in page and "a&amp;b" in page and "each image alone" in page

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.evaluation.tsne import affinities, gradient, squared_distances, tsne
-from shards.errors import UsageError
+from pipeline.common.errors import UsageError
+from pipeline.paper.tsne import affinities, gradient, squared_distances, tsne
 
 
 @pytest.fixture

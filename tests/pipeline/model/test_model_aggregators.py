@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig, PoolingConfig
 from pipeline.config.baselines import BoQConfig, CosPlaceConfig, MixVPRConfig, NetVLADConfig, SALADConfig
 from pipeline.model.aggregators import AGGREGATORS, build_pooling
@@ -17,7 +18,6 @@ from pipeline.model.aggregators.netvlad import NetVLAD, k_means
 from pipeline.model.aggregators.salad import transport
 from pipeline.model.variants import BASELINES, PAPER, variant
 from pipeline.model.vpr import build_model, parameter_counts
-from shards.errors import UsageError
 
 DIM, GRID = 12, 5
 TINY = PoolingConfig(

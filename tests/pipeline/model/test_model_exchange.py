@@ -12,11 +12,11 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from pipeline.common.errors import DataError, UsageError, UserError
 from pipeline.config import BackboneConfig, ModelConfig
-from pipeline.model import exchange
 from pipeline.model.vpr import PlaceModel, build_model
-from pipeline.model.weights import load_model, save_model
-from shards.errors import DataError, UsageError, UserError
+from pipeline.model.weights import convert
+from pipeline.model.weights.files import load_model, save_model
 
 SIZE = 42
 onnx_packages = pytest.mark.skipif(
@@ -40,7 +40,7 @@ def away_from_start(config: ModelConfig) -> PlaceModel:
 def released_model(tmp_path: Path, small: ModelConfig) -> tuple[PlaceModel, Path]:
     """A small model, and its weights as a trainer of parallel modules would have saved them."""
     model, path = away_from_start(small), tmp_path / "CricaVPR.pth"
-    exchange.write_published(model, path)
+    convert.write_published(model, path)
     state = torch.load(path, weights_only=True)
     torch.save({"epoch_num": 3, "model_state_dict": {f"module.{n}": t for n, t in state.items()}}, path)
     return model, path
@@ -50,15 +50,15 @@ def test_a_release_with_prefixes_becomes_one_file_that_stands_alone(
     released_model: tuple[PlaceModel, Path], small: ModelConfig, small_images: Tensor, tmp_path: Path
 ) -> None:
     model, path = released_model
-    assert exchange.kind_of(str(path)) == "cricavpr"
-    read = exchange.read_model(str(path), "cricavpr", small, SIZE)
+    assert convert.kind_of(str(path)) == "cricavpr"
+    read = convert.read_model(str(path), "cricavpr", small, SIZE)
     target = tmp_path / "out" / "x.safetensors"
-    exchange.write_model(read, target, str(path))
+    convert.write_model(read, target, str(path))
     path.unlink()
     with torch.no_grad():
         assert torch.equal(load_model(target)(small_images), model(small_images))
-    assert exchange.kind_of(str(target)) == "model"
-    exchange.write_published(load_model(target), tmp_path / "again.pth")
+    assert convert.kind_of(str(target)) == "model"
+    convert.write_published(load_model(target), tmp_path / "again.pth")
     again, stored = torch.load(tmp_path / "again.pth", weights_only=True), load_file(target)
     assert list(again) and again.keys() == stored.keys()
     assert all(torch.equal(again[name], stored[name]) for name in stored)
@@ -74,7 +74,7 @@ def test_a_trained_checkpoint_without_its_backbone_becomes_whole(
     model = build_model(config, SIZE).eval()
     best = tmp_path / "run" / "checkpoints" / "best" / "model.safetensors"
     save_model(model, best, config, SIZE, everything=False, extra={"step": 7})
-    exchange.write_model(exchange.read_model(str(tmp_path / "run"), "model", small, None), tmp_path / "w.safetensors",
+    convert.write_model(convert.read_model(str(tmp_path / "run"), "model", small, None), tmp_path / "w.safetensors",
                          str(tmp_path / "run"))  # fmt: skip
     release.unlink()
     with torch.no_grad():
@@ -85,8 +85,8 @@ def test_a_trained_checkpoint_without_its_backbone_becomes_whole(
 
 def test_another_input_size_keeps_the_weights(small: ModelConfig, tmp_path: Path) -> None:
     model = away_from_start(small)
-    exchange.write_model(model, tmp_path / "m.safetensors", "here")
-    larger = exchange.read_model(str(tmp_path / "m.safetensors"), "model", small, 56)
+    convert.write_model(model, tmp_path / "m.safetensors", "here")
+    larger = convert.read_model(str(tmp_path / "m.safetensors"), "model", small, 56)
     assert larger.image_size == 56 and larger.backbone.grid == 8  # type: ignore[union-attr]
     assert all(torch.equal(t, larger.state_dict()[n]) for n, t in model.state_dict().items())
 
@@ -98,32 +98,32 @@ def test_backbones_are_told_by_width_depth_and_parts(tmp_path: Path) -> None:
         state |= {f"blocks.{i}.norm1.weight": torch.ones(1) for i in range(depth)}
         state |= {"register_tokens": torch.ones(1)} if registers else {}
         torch.save(state, tmp_path / "b.pth")
-        assert exchange.kind_of(str(tmp_path / "b.pth")) == "backbone"
-        assert exchange.fitting_backbone(str(tmp_path / "b.pth"), BackboneConfig()).name == name
+        assert convert.kind_of(str(tmp_path / "b.pth")) == "backbone"
+        assert convert.fitting_backbone(str(tmp_path / "b.pth"), BackboneConfig()).name == name
     state = {"norm.weight": torch.ones(100), "blocks.0.norm1.weight": torch.ones(1), "pos_embed": torch.ones(1)}
     torch.save(state, tmp_path / "b.pth")
     with pytest.raises(UsageError, match="1 blocks of width 100 are none of the named backbones"):
-        exchange.fitting_backbone(str(tmp_path / "b.pth"), BackboneConfig())
+        convert.fitting_backbone(str(tmp_path / "b.pth"), BackboneConfig())
 
 
 def test_a_backbone_file_holds_the_release_tensor_by_tensor(
     small: ModelConfig, small_release: dict[str, Tensor], tmp_path: Path
 ) -> None:
     torch.save({"teacher": small_release}, tmp_path / "dinov2.pth")
-    exchange.write_backbone(str(tmp_path / "dinov2.pth"), small.backbone, tmp_path / "b.safetensors")
+    convert.write_backbone(str(tmp_path / "dinov2.pth"), small.backbone, tmp_path / "b.safetensors")
     stored = load_file(tmp_path / "b.safetensors")
     assert stored.keys() == small_release.keys()
     assert all(torch.equal(stored[name], tensor) for name, tensor in small_release.items())
     wide = dataclasses.replace(small.backbone, dim=48)
     with pytest.raises(UsageError, match=r"dinov2\.pth .* the model wants"):
-        exchange.write_backbone(str(tmp_path / "dinov2.pth"), wide, tmp_path / "c.safetensors")
+        convert.write_backbone(str(tmp_path / "dinov2.pth"), wide, tmp_path / "c.safetensors")
     assert not list(tmp_path.glob("*c.safetensors"))
 
 
 def test_a_backbone_is_no_cricavpr(small: ModelConfig, small_release: dict[str, Tensor], tmp_path: Path) -> None:
     torch.save(small_release, tmp_path / "dinov2.pth")
     with pytest.raises(UsageError, match="neither adapters nor a cross-image encoder"):
-        exchange.read_model(str(tmp_path / "dinov2.pth"), "cricavpr", small, None)
+        convert.read_model(str(tmp_path / "dinov2.pth"), "cricavpr", small, None)
 
 
 @onnx_packages
@@ -131,7 +131,7 @@ def test_onnx_computes_what_torch_computes(small: ModelConfig, tmp_path: Path) -
     """Descriptors of five images at once, each its own group, against torch taking them one at a time."""
     import onnxruntime
 
-    from pipeline.model import onnx_export
+    from pipeline.model.weights import onnx_export
 
     small = dataclasses.replace(
         small,  # the exporter's time is by the operator
@@ -161,7 +161,7 @@ def test_onnx_computes_what_torch_computes(small: ModelConfig, tmp_path: Path) -
 @onnx_packages
 @pytest.mark.slow
 def test_onnx_of_regions(small: ModelConfig, tmp_path: Path) -> None:
-    from pipeline.model import onnx_export
+    from pipeline.model.weights import onnx_export
 
     assert onnx_export.export_onnx(away_from_start(small), tmp_path / "m.onnx", "regions") < 1e-4
 
@@ -169,7 +169,7 @@ def test_onnx_of_regions(small: ModelConfig, tmp_path: Path) -> None:
 def test_without_the_packages_onnx_is_refused_in_one_line(
     small: ModelConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from pipeline.model import onnx_export
+    from pipeline.model.weights import onnx_export
 
     monkeypatch.setattr(onnx_export, "PACKAGES", ("no_such_package",))
     with pytest.raises(UsageError, match=r"needs no_such_package: pip install .*\[onnx\]"):

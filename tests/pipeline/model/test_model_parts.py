@@ -9,11 +9,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from pipeline.common.errors import UsageError
 from pipeline.config import AdapterConfig, BackboneConfig, ModelConfig, PoolingConfig
 from pipeline.model.adapters import ConvAdapter, build_adapter
-from pipeline.model.backbone import Backbone, resize_positions
+from pipeline.model.backbones.transformer import Backbone, resize_positions
 from pipeline.model.pooling import Pooling, cell_edges
-from shards.errors import UsageError
 
 
 @pytest.mark.parametrize(

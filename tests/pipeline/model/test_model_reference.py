@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from pipeline.model.names import layout
 from pipeline.model.vpr import PlaceModel, parameter_counts
-from pipeline.model.weights import from_published
+from pipeline.model.weights.files import from_published
+from pipeline.model.weights.names import layout
 from pipeline.training.loss import MultiSimilarityLoss
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from pipeline.config import AdapterConfig, ModelConfig
-from pipeline.model.backbone import Backbone
+from pipeline.model.backbones.transformer import Backbone
 from pipeline.model.vpr import build_model
 
 SIZE = 42

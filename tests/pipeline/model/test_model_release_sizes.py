@@ -21,13 +21,13 @@ from releases_restated import (
     vlad_shapes,
 )
 
+from pipeline.common.errors import UsageError
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, PoolingConfig
 from pipeline.config.baselines import ResNetConfig
-from pipeline.model.releases import from_release, recognise
 from pipeline.model.variants import variant
 from pipeline.model.vpr import parameter_counts
-from pipeline.model.weights import without_weights
-from shards.errors import UsageError
+from pipeline.model.weights.files import without_weights
+from pipeline.model.weights.released import from_release, recognise
 
 GEM: Shape = {"aggregation.1.p": (1,)}
 MIXVPR = [f"backbone.model.{part}" for part in NAMED]

@@ -34,12 +34,12 @@ from releases_restated import (
 )  # fmt: skip
 from torch import Tensor
 
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import ModelConfig
-from pipeline.model import exchange
-from pipeline.model.releases import RELEASES, from_release, recognise
 from pipeline.model.vpr import PlaceModel
-from pipeline.model.weights import load_model
-from shards.errors import DataError, UsageError
+from pipeline.model.weights import convert
+from pipeline.model.weights.files import load_model
+from pipeline.model.weights.released import RELEASES, from_release, recognise
 
 GEM: Shape = {"aggregation.1.p": (1,)}
 SFRS_MEAN = (0.48501960784313836, 0.4579568627450961, 0.4076039215686255)  # its own normalisation, deviation 1 / 255
@@ -204,8 +204,8 @@ def test_wrappers_prefixes_and_half_precision_are_taken_off(tmp_path: Path) -> N
     wrapped = {n.replace("encoder.", "encoder.module.").replace("pool.", "pool.module."): t for n, t in state.items()}
     path = tmp_path / "model_best.pth.tar"
     torch.save({"epoch": 3, "state_dict": wrapped, "recalls": {1: 0.8}, "optimizer": {"state": {}}}, path)
-    assert exchange.kind_of(str(path)) == kind
-    model = exchange.read_model(str(path), kind, ModelConfig(), size)
+    assert convert.kind_of(str(path)) == kind
+    model = convert.read_model(str(path), kind, ModelConfig(), size)
     images = torch.randn(1, 3, size, size)
     with torch.no_grad():
         assert torch.allclose(model(images), forward(state, images), atol=1e-5)
@@ -222,12 +222,12 @@ def test_wrappers_prefixes_and_half_precision_are_taken_off(tmp_path: Path) -> N
 def test_one_file_of_ours_holds_it_all(name: str, tmp_path: Path) -> None:
     kind, size, shapes, _ = CASES[name]
     model = from_release(filled(shapes), "a.pth", kind, size)
-    exchange.write_model(model, tmp_path / "x.safetensors", "a.pth")
+    convert.write_model(model, tmp_path / "x.safetensors", "a.pth")
     again: PlaceModel = load_model(tmp_path / "x.safetensors")
     images = torch.randn(1, 3, size, size)
     with torch.no_grad():
         assert torch.equal(again(images), model(images))
-    assert exchange.kind_of(str(tmp_path / "x.safetensors")) == "model"
+    assert convert.kind_of(str(tmp_path / "x.safetensors")) == "model"
 
 
 def without(state: State, name: str) -> State:
@@ -275,4 +275,4 @@ def test_code_in_a_checkpoint_is_never_run(tmp_path: Path) -> None:
     state = filled(CASES["SFRS"][2])
     torch.save({"state_dict": state, "args": Path("an object")}, tmp_path / "openibl.pth.tar")
     with pytest.raises(DataError, match=r"openibl\.pth\.tar: not loaded.*foreign code is never run"):
-        exchange.kind_of(str(tmp_path / "openibl.pth.tar"))
+        convert.kind_of(str(tmp_path / "openibl.pth.tar"))

@@ -15,13 +15,13 @@ from processes import run_ranks
 from safetensors.torch import save_file
 from torch import Tensor
 
+from pipeline.common.errors import UsageError
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, PoolingConfig
 from pipeline.config.baselines import ResNetConfig
 from pipeline.data.images import normalise
 from pipeline.distributed import rank_slice
-from pipeline.model.resnet import ResNet
+from pipeline.model.backbones.resnet import ResNet
 from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
-from shards.errors import UsageError
 
 TINY = ModelConfig(
     backbone=BackboneConfig(name="resnet_custom", resnet=ResNetConfig(cut="layer3", stages=(1, 2, 1), width=4)),

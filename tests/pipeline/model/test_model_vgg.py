@@ -10,13 +10,13 @@ import torch
 import torch.nn.functional as F
 from releases_restated import dinov2, dinov2_shapes, filled, vgg, vgg_shapes
 
+from pipeline.common.errors import UsageError
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, PoolingConfig
 from pipeline.config.baselines import NetVLADConfig, VGGConfig
 from pipeline.model.aggregators.netvlad import NetVLAD
-from pipeline.model.names import to_published
-from pipeline.model.vgg import VGG
+from pipeline.model.backbones.vgg import VGG
 from pipeline.model.vpr import build_model
-from shards.errors import UsageError
+from pipeline.model.weights.names import to_published
 
 CONFIG = ModelConfig(
     backbone=BackboneConfig(name="vgg16"),

@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from pipeline.common.errors import UsageError
 from pipeline.config import AdapterConfig, CrossImageConfig, ModelConfig
 from pipeline.model.variants import PAPER, variant
 from pipeline.model.vpr import build_model, parameter_counts
-from pipeline.model.weights import frozen_hash
-from shards.errors import UsageError
+from pipeline.model.weights.files import frozen_hash
 
 SIZE = 42
 

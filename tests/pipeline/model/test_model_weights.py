@@ -11,11 +11,10 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from pipeline.common.errors import DataError, UsageError, UserError
 from pipeline.config import ModelConfig
-from pipeline.model.names import layout, published_name, to_published
-from pipeline.model.pretrained import read_tensors
 from pipeline.model.vpr import PlaceModel, build_model
-from pipeline.model.weights import (
+from pipeline.model.weights.files import (
     checkpoint_file,
     from_published,
     frozen_hash,
@@ -24,7 +23,8 @@ from pipeline.model.weights import (
     read_metadata,
     save_model,
 )
-from shards.errors import DataError, UsageError, UserError
+from pipeline.model.weights.names import layout, published_name, to_published
+from pipeline.model.weights.pretrained import read_tensors
 
 SIZE = 42
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import RunConfig, TrainConfig, flatten
 from pipeline.training import checkpoint
 from pipeline.training.checkpoint import RunState
 from pipeline.training.schedule import learning_rate
-from shards.errors import DataError, UsageError
 
 
 def save(run: Path, step: int, note: str = "weights") -> Path:

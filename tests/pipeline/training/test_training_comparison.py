@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig, TrackingConfig
 from pipeline.training import comparison
 from pipeline.training.tracking import Tracker, store_uri
-from shards.errors import UsageError
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ import yaml
 from precision_runs import launch, tiny_config, weights
 from tiny import prepare
 
+from pipeline.common.errors import UsageError
 from pipeline.config import BackboneConfig, ModelConfig, RunConfig, TrainConfig
 from pipeline.model.vpr import build_model
 from pipeline.training.compiled import compile_backbone
-from shards.errors import UsageError
 
 TINY = ModelConfig(backbone=BackboneConfig(name="custom", dim=16, depth=2, heads=2, patch=7, pretrain_grid=4))
 COMPILED = RunConfig(
@@ -72,7 +72,7 @@ def test_the_same_training_alone_and_under_ddp(tmp_path: Path) -> None:
 def build_model_of(config: Path) -> dict[str, torch.Tensor]:
     """The weights a run of this config starts from, by the names its checkpoint has."""
     from pipeline.config import from_dict
-    from pipeline.model.names import to_published
+    from pipeline.model.weights.names import to_published
 
     run: RunConfig = from_dict(RunConfig, yaml.safe_load(config.read_text()))
     torch.manual_seed(run.seed)

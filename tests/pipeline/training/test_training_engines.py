@@ -16,12 +16,12 @@ from launched import ENGINES, Launched
 from safetensors.torch import load_file
 from tiny import prepare, run_settings
 
+from pipeline.common.errors import UsageError
 from pipeline.config import TrainConfig
-from pipeline.model.weights import load_model
-from pipeline.training.agreement import compare
-from pipeline.training.engine import choose
-from pipeline.training.zero import zero_settings
-from shards.errors import UsageError
+from pipeline.model.weights.files import load_model
+from pipeline.training.engine_parity import compare
+from pipeline.training.engines.build import choose
+from pipeline.training.engines.zero import zero_settings
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_launches_that_contradict_the_settings_are_refused(monkeypatch: pytest.M
     with pytest.raises(UsageError, match="launched with DeepSpeed"):
         choose("ddp")
     monkeypatch.delenv("ACCELERATE_USE_DEEPSPEED")
-    monkeypatch.setattr("pipeline.training.engine.is_distributed", lambda: True)
+    monkeypatch.setattr("pipeline.training.engines.build.is_distributed", lambda: True)
     monkeypatch.setenv("ACCELERATE_USE_FSDP", "true")
     monkeypatch.setenv("FSDP_VERSION", "1")
     with pytest.raises(UsageError, match="fsdp_version: 2"):

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 from processes import free_port
 
+from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig, TrackingConfig
 from pipeline.training.tracking import Tracker, open_client
-from shards.errors import UsageError
 
 pytestmark = pytest.mark.slow  # a server takes ten seconds to start
 

@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from tiny import prepare, run_settings
 
 from pipeline.data.plan import plan
-from pipeline.training.agreement import compare
+from pipeline.training.engine_parity import compare
 from shards.index import read_index
 
 LAUNCHER = [sys.executable, "-m", "accelerate.commands.accelerate_cli", "launch"]

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.common.errors import UsageError
 from pipeline.config import EvaluationConfig, RunConfig
 from pipeline.training.validation import Validation
-from shards.errors import UsageError
 
 
 def test_a_set_that_cannot_be_scored_is_refused_at_the_start(tmp_path: Path) -> None:

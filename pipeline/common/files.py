@@ -1,0 +1,33 @@
+"""Writing so that a kill or a power failure leaves a file whole or absent."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def write_atomically(path: Path, data: bytes, temporary: Path | None = None) -> None:
+    """Writes a small file so that it is either whole under its name or not there at all, even if the power fails."""
+    temporary = temporary or path.with_name(path.name + ".tmp")
+    with temporary.open("wb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.rename(path)
+    sync_path(path.parent)
+
+
+def usual_permissions(path: Path) -> None:
+    """Those of a file that is simply opened: safetensors writes for the owner alone, and colleagues read these."""
+    mask = os.umask(0)
+    os.umask(mask)
+    path.chmod(0o666 & ~mask)
+
+
+def sync_path(path: Path) -> None:
+    """Forces a file's bytes, or a folder's names, to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

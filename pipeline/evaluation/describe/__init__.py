@@ -1,0 +1,1 @@
+"""From images to descriptors, kept in memory or in a store."""

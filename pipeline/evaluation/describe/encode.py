@@ -1,0 +1,325 @@
+"""Descriptors of a set of images, computed by all processes together: `encode` once an image, `correlate` per group.
+
+Invariant: W never changes a descriptor. Forward batches of the per-image part and groups of the cross-image encoder
+are both cut from positions in the dataset, then dealt to ranks whole; a group is always one call of `correlate`, and
+groups of one image are called many together (`calls_of`), cut by position too. So ranks even agree to the last bit on
+like hardware, where cutting batches per rank would leave rounding differences.
+
+The regions [R, D] of an image are computed once and kept (memory, or a file for large sets) by the ranks whose
+groups need them, so that all groupings cost one pass of the backbone. Sharded engines (FSDP2, ZeRO-3) need every
+rank to call the model equally often: a rank without work passes zeros and drops the result.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from pipeline import distributed
+from pipeline.common.errors import DataError
+from pipeline.common.progress import Progress
+from pipeline.config import EvaluationConfig
+from pipeline.data.images import load_image, normalise, to_input
+from pipeline.evaluation.protocol import Protocol, Side
+
+ALONE = 64  # images correlated in one call where each is a group of its own
+BLOCK_BYTES = 64 * 2**20  # descriptors handed over at once: the memory of a gather, and the size of a stored part
+REGIONS_IN_MEMORY = 4 * 2**30  # bytes of regions a rank keeps in memory before it turns to a file
+TOLD = 5_000  # images from which the second step, quick beside the backbone, has a progress line of its own
+Block = list[np.ndarray]
+"""Consecutive groups that are computed, gathered and stored together."""
+
+
+def blocks_of(groups: Sequence[np.ndarray], dim: int, limit: int = BLOCK_BYTES) -> list[Block]:
+    """Cuts groups into blocks of about `limit` bytes of float32 descriptors, whatever W is; at least a group each."""
+    blocks: list[Block] = []
+    rows = 0
+    for group in groups:
+        if not blocks or (rows + len(group)) * dim * 4 > limit:
+            blocks.append([])
+            rows = 0
+        blocks[-1].append(group)
+        rows += len(group)
+    return blocks
+
+
+def calls_of(protocol: Protocol, images: int, side: Side, model: Any) -> tuple[list[np.ndarray], bool]:
+    """(What is correlated in a call, whether its images are groups of one each): the groups, one a call; but of groups
+    of one image `ALONE` together, where the model can. Cut by position, so the number of processes changes nothing."""
+    if protocol.group_size > 1 or not getattr(model, "correlates_alone", False):
+        return protocol.form(images, side), False
+    return protocol.form(images, side, ALONE), True
+
+
+class _Batches(torch.utils.data.Dataset[tuple[Tensor, str]]):
+    """The forward batches of one rank, decoded: item i is ([n, 3, S, S], "") or (nothing, what is broken)."""
+
+    def __init__(self, paths: Sequence[Path], batches: list[np.ndarray], size: int, resize: Any) -> None:
+        self.paths, self.batches, self.size, self.resize = paths, batches, size, resize
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, str]:
+        try:
+            images = [to_input(load_image(self.paths[p]), self.size, self.resize) for p in self.batches[index]]
+        except (DataError, OSError) as error:
+            return torch.empty(0), str(error)
+        return torch.stack(images), ""
+
+
+@dataclass
+class Regions:
+    """The regional features of the positions that this rank's groups need.
+
+    `positions` [n] sorted, `values` [n, R, D]; in memory, or a memory-mapped file of `_allocate`.
+    """
+
+    positions: np.ndarray
+    values: np.ndarray
+
+    def put(self, positions: np.ndarray, regions: np.ndarray) -> None:
+        """Keeps those of the given rows that are wanted here."""
+        if len(self.positions):
+            slots = np.minimum(np.searchsorted(self.positions, positions), len(self.positions) - 1)
+            wanted = self.positions[slots] == positions
+            self.values[slots[wanted]] = regions[wanted]
+
+    def take(self, positions: np.ndarray) -> Tensor:
+        """Regions [n, R, D] of positions that were put before."""
+        return torch.from_numpy(np.ascontiguousarray(self.values[np.searchsorted(self.positions, positions)]))
+
+
+@contextlib.contextmanager
+def evaluating(model: nn.Module) -> Iterator[None]:
+    """Eval mode without gradients; the mode of before afterwards."""
+    training = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        model.train(training)
+
+
+def encode(
+    model: nn.Module,
+    paths: Sequence[Path],
+    wanted: Sequence[Sequence[Block]],
+    config: EvaluationConfig,
+    device: torch.device,
+    label: str = "encoding",
+    scratch: Path | None = None,
+    key: str = "",
+    progress: bool = True,
+) -> Regions:
+    """Runs the per-image part over `paths`, each once. Collective.
+
+    Args:
+        model: has `encode(images [b, 3, S, S]) -> [b, R, D]`, `regions`, `descriptor_dim` and `image_size`.
+        wanted: for each grouping, the blocks that will be correlated; a rank keeps what its groups in them need.
+        scratch: folder for the regions of sets too large for memory; None: memory alone.
+        key: what the regions depend on; a file in `scratch` left by a killed run with the same key is continued.
+
+    Raises:
+        DataError: images that cannot be read, named, on all ranks alike.
+    """
+    w, r = distributed.world_size(), distributed.rank()
+    mine = [block[j] for blocks in wanted for block in blocks for j in range(r, len(block), w)]
+    positions = np.unique(np.concatenate(mine)) if mine else np.empty(0, np.int64)
+    shape = (len(positions), *region_shape(model))
+    dtype = _dtype(model)
+    values, resume = _allocate(shape, dtype, scratch, f"{key} {r}/{w} {zlib.crc32(positions.tobytes())}")
+    regions = Regions(positions, values)
+
+    batches = [np.arange(s, min(s + config.batch, len(paths))) for s in range(0, len(paths), config.batch)]
+    steps = -(-len(batches) // w)
+    first = min(distributed.gather_uneven(torch.tensor([resume.done], device=device)).tolist())
+    own = [batches[step * w + r] for step in range(first, steps) if step * w + r < len(batches)]
+    size = int(model.image_size)  # type: ignore[arg-type]
+    loader = iter(_loader(_Batches(paths, own, size, config.resize), config.workers))
+    total = sum(len(batch) for batch in batches[first * w :])
+    with Progress(label, total, "images", enabled=progress and r == 0) as bar:
+        for step in range(first, steps):
+            dealt = batches[step * w : (step + 1) * w]
+            images, problem = next(loader) if r < len(dealt) else (torch.zeros(1, 3, size, size), "")
+            raise_together(problem, device)
+            encoded = _forward(model.encode, images, config, device, dtype)  # type: ignore[arg-type]
+            gathered = distributed.gather_uneven(encoded if r < len(dealt) else encoded[:0])
+            regions.put(np.concatenate(dealt), gathered.cpu().numpy())
+            resume.advance(step + 1, values, final=step + 1 == steps)
+            bar.advance(sum(len(batch) for batch in dealt))
+    return regions
+
+
+def describe_alone(model: nn.Module, photo: Path, resize: Any, precision: Any, device: torch.device) -> np.ndarray:
+    """The descriptor [1, dim] of one photo, in a forward pass of its own: other photos cannot even change its rounding.
+
+    For a model in `evaluating`. Raises `DataError` naming a broken photo.
+    """
+    images = to_input(load_image(photo), int(model.image_size), resize)[None]  # type: ignore[arg-type]
+    config = EvaluationConfig(precision=precision)
+    regions = _forward(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
+    described: np.ndarray = model.correlate(regions).float().cpu().numpy()  # type: ignore[operator]
+    return described
+
+
+def describe_each(
+    model: nn.Module,
+    paths: Sequence[Path],
+    config: EvaluationConfig,
+    device: torch.device,
+    label: str = "describing",
+    progress: bool = True,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(positions [n], descriptors [n, dim]) of images, each a group of its own, a forward batch at a time.
+
+    For a model in `evaluating`, on one process; nothing is kept. With `config.batch` 1 each is what `describe_alone`
+    gives, to the last bit. Raises `DataError` naming a broken image, after what came before it was given.
+    """
+    size, together = int(model.image_size), getattr(model, "correlates_alone", False)  # type: ignore[arg-type]
+    batches = [np.arange(s, min(s + config.batch, len(paths))) for s in range(0, len(paths), config.batch)]
+    loader = _loader(_Batches(paths, batches, size, config.resize), config.workers)
+    with Progress(label, len(paths), "images", enabled=progress) as bar:
+        for batch, (images, problem) in zip(batches, loader, strict=True):
+            if problem:
+                raise DataError(problem)
+            regions = _forward(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
+            if together and len(batch) > 1:
+                described = model.correlate(regions, alone=True)  # type: ignore[operator]
+            else:
+                described = torch.cat([model.correlate(one[None]) for one in regions])  # type: ignore[operator]
+            yield batch, described.float().cpu().numpy()
+            bar.advance(len(batch))
+
+
+def correlate(
+    model: nn.Module,
+    regions: Regions,
+    blocks: Sequence[Block],
+    keep: Callable[[int, np.ndarray, np.ndarray], None],
+    device: torch.device,
+    done: frozenset[int] = frozenset(),
+    label: str = "correlating",
+    progress: bool = True,
+    alone: bool = False,
+) -> None:
+    """Runs the cross-image encoder over groups. Collective.
+
+    Args:
+        model: has `correlate(regions [n, R, D]) -> descriptors [n, dim]`, of one group.
+        keep: called on rank 0 alone with (number of the block, positions [n], descriptors [n, dim]).
+        done: numbers of blocks that are stored already; the same on all ranks.
+        alone: the blocks' "groups" are calls of many groups of one image each (`calls_of`).
+    """
+    w, r = distributed.world_size(), distributed.rank()
+    todo = [number for number in range(len(blocks)) if number not in done]
+    total = sum(len(group) for number in todo for group in blocks[number])
+    shape = regions.values.shape[1:]
+    together = {"alone": True} if alone else {}
+    with Progress(label, total, "images", enabled=progress and r == 0 and total >= TOLD) as bar:
+        for number in todo:
+            block = blocks[number]
+            own: list[Tensor] = []
+            for call in range(-(-len(block) // w)):
+                j = call * w + r
+                group = regions.take(block[j]) if j < len(block) else _zeros(shape, regions.values.dtype)
+                described = model.correlate(group.to(device), **together)  # type: ignore[operator]
+                own.append(described if j < len(block) else described[:0])
+            gathered = distributed.gather_uneven(torch.cat(own))
+            if r == 0:
+                order = [block[j] for rank in range(w) for j in range(rank, len(block), w)]
+                keep(number, np.concatenate(order), gathered.cpu().numpy())
+            bar.advance(sum(len(group) for group in block))
+
+
+def _forward(
+    encode: Callable[[Tensor], Tensor], images: Tensor, config: EvaluationConfig, device: torch.device, dtype: Any
+) -> Tensor:
+    """Normalised on the device where the loader left bytes; regions in the type they are kept in."""
+    images = images.to(device, non_blocking=True)
+    images = normalise(images, dtype=dtype) if images.dtype == torch.uint8 else images.to(dtype)
+    if config.precision == "fp32":
+        return encode(images).to(dtype)
+    half = torch.bfloat16 if config.precision == "bf16" else torch.float16
+    with torch.autocast(device.type, dtype=half):
+        return encode(images).to(dtype)
+
+
+def region_shape(model: Any) -> tuple[int, int]:
+    """(R, D) of a model's regions."""
+    return int(model.regions), int(model.descriptor_dim) // int(model.regions)
+
+
+def _dtype(model: nn.Module) -> torch.dtype:
+    """float32, or float64 for a model in float64 (tests of exactness)."""
+    parameter = next(model.parameters(), None)
+    return torch.float64 if parameter is not None and parameter.dtype == torch.float64 else torch.float32
+
+
+def _zeros(shape: tuple[int, ...], dtype: Any) -> Tensor:
+    return torch.from_numpy(np.zeros((1, *shape), dtype))
+
+
+def _loader(dataset: _Batches, workers: int) -> torch.utils.data.DataLoader[tuple[Tensor, str]]:
+    """Whole batches in order. Its own generator: a validation must not advance the training's random state."""
+    workers = min(workers, len(dataset)) if len(dataset) > 1 else 0
+    return torch.utils.data.DataLoader(
+        dataset,
+        batch_size=None,
+        num_workers=workers,
+        generator=torch.Generator(),
+        prefetch_factor=2 if workers else None,
+    )
+
+
+def raise_together(problem: str, device: torch.device) -> None:
+    """Raises the same DataError on every rank as soon as one has a problem, so that none waits for ever."""
+    if not distributed.any_rank(bool(problem), device):
+        return
+    problems: list[str] = [problem]
+    if distributed.is_distributed():
+        problems = [""] * distributed.world_size()
+        torch.distributed.all_gather_object(problems, problem)
+    raise DataError("; ".join(p for p in problems if p))
+
+
+class _Resume:
+    """How many steps of a scratch file are complete; nothing for regions in memory."""
+
+    def __init__(self, file: Path | None, key: str) -> None:
+        self.file, self.key, self.done = file, key, 0
+        if file is not None and file.is_file():
+            left = json.loads(file.read_text())
+            self.done = int(left["done"]) if left["key"] == key else 0
+
+    def advance(self, done: int, values: np.ndarray, final: bool) -> None:
+        self.done = done
+        if self.file is not None and isinstance(values, np.memmap) and (final or done % 64 == 0):
+            values.flush()
+            fresh = self.file.with_suffix(".tmp")
+            fresh.write_text(json.dumps({"key": self.key, "done": done}))
+            fresh.replace(self.file)
+
+
+def _allocate(shape: tuple[int, ...], dtype: torch.dtype, scratch: Path | None, key: str) -> tuple[np.ndarray, _Resume]:
+    """Room for regions: memory, or a file for what exceeds `REGIONS_IN_MEMORY`, continued where its key agrees."""
+    kind = np.float64 if dtype == torch.float64 else np.float32
+    size = int(np.prod(shape)) * np.dtype(kind).itemsize
+    if scratch is None or size <= REGIONS_IN_MEMORY:
+        return np.empty(shape, kind), _Resume(None, key)
+    scratch.mkdir(parents=True, exist_ok=True)
+    file = scratch / f"regions.{distributed.rank()}.bin"
+    resume = _Resume(file.with_suffix(".json"), f"{key} {shape} {np.dtype(kind)}")
+    if not file.is_file() or file.stat().st_size != size:
+        resume.done = 0
+    return np.memmap(file, kind, mode="r+" if resume.done else "w+", shape=shape), resume

@@ -1,0 +1,184 @@
+"""Results as people and programs read them: one terminal table, markdown, CSV and JSON.
+
+Invariant: a recall is never written without its protocol; the groupings of a set stand next to each other, and the
+paper's figures, where it gives any, stand in the row of the same protocol, or in a row of their own with theirs.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.common.errors import DataError
+from pipeline.evaluation.evaluate import Result
+from pipeline.evaluation.protocol import metric_name
+from pipeline.evaluation.report.paper_numbers import FIGURES, HEADLINE, Reported, reported
+
+FORMAT_VERSION = 1
+
+
+def paper_figures(result: Result) -> Reported | None:
+    """The paper's figures for this set under this protocol (but for interpolation), where it gives them."""
+    name = result.protocol.name.replace("_published", "")
+    return FIGURES.get((result.set_name, HEADLINE, name))
+
+
+def rows(results: Sequence[Result]) -> list[dict[str, str]]:
+    """One dict of texts a row: set, protocol, the recalls, counts, the paper's recalls. Best of a set marked `*`."""
+    ks = sorted({k for result in results for k in result.recalls})
+    table: list[dict[str, str]] = []
+    for set_name, group in _by_set(results):
+        scored = [result for result in group if result.recalls]
+        best = {k: max(r.recalls[k] for r in scored if k in r.recalls) for k in ks} if scored else {}
+        matched = False
+        for result in group:
+            paper = paper_figures(result)
+            matched |= paper is not None
+            row = {"set": set_name, "protocol": result.protocol.name}
+            for k in ks:
+                value = result.recalls.get(k)
+                mark = "*" if len(scored) > 1 and value is not None and value == best[k] else ""
+                row[f"R@{k}"] = "-" if value is None else f"{value:.1f}{mark}"
+            row["queries"] = f"{result.queries:,}"
+            row["database"] = f"{result.database:,}"
+            row["no positive"] = f"{result.without_positives:,}"
+            row["paper R@1/5/10"] = _cells(paper)
+            table.append(row)
+        headline = reported(set_name)
+        if headline is not None and not matched:
+            theirs = f"paper: ordered{headline.group_size}, PCA 4096"
+            recalls = {f"R@{k}": _percent(headline.at(k)) for k in ks}
+            table.append({"set": set_name, "protocol": theirs, **recalls, "paper R@1/5/10": _cells(headline)})
+    if not any(row.get("paper R@1/5/10", "-") != "-" for row in table):
+        for row in table:
+            row.pop("paper R@1/5/10", None)
+    return table
+
+
+def terminal(results: Sequence[Result]) -> str:
+    """The table as aligned text with rules between sets, the protocols spelt out below it."""
+    table = rows(results)
+    if not table:
+        return "no results"
+    columns = list(table[0])
+    widths = {c: max(len(c), *(len(row.get(c, "")) for row in table)) for c in columns}
+
+    def line(row: dict[str, str]) -> str:
+        cells = (row.get(c, "").ljust(widths[c]) if c in ("set", "protocol") else _right(row, c) for c in columns)
+        return "  ".join(cells).rstrip()
+
+    def _right(row: dict[str, str], column: str) -> str:
+        # the mark of the best hangs to the right, so that the digits stand in line
+        text = row.get(column, "")
+        return (text if text.endswith("*") or not column.startswith("R@") else text + " ").rjust(widths[column] + 1)
+
+    rule = "-" * (sum(widths[c] + 3 for c in columns) - 2 - 2)
+    out = [line({c: c for c in columns}), rule]
+    previous = table[0]["set"]
+    for row in table:
+        if row["set"] != previous:
+            out.append(rule)
+            previous, shown = row["set"], row
+        else:
+            shown = row if row is table[0] else {**row, "set": ""}
+        out.append(line(shown))
+    return "\n".join([*out, rule, *notes(results)])
+
+
+def notes(results: Sequence[Result]) -> list[str]:
+    """What the short names of protocols mean, which queries have no positive, and remarks: each once."""
+    lines: dict[str, None] = {}
+    if any(len(group) > 1 for _, group in _by_set(results)):
+        lines["* best of its set; recalls in percent"] = None
+    for result in results:
+        lines[f"{result.protocol.name}: {result.protocol.describe()}"] = None
+    for result in results:
+        if result.without_positives:
+            done = "counted as misses" if result.protocol.without_positives == "miss" else "dropped"
+            lines[f"{result.set_name}: {result.without_positives:,} queries have no positive and are {done}"] = None
+        for remark in result.remarks:
+            lines[f"{result.set_name}: {remark}"] = None
+    return list(lines)
+
+
+def markdown(results: Sequence[Result]) -> str:
+    """The table and its notes as markdown."""
+    table = rows(results)
+    if not table:
+        return "no results\n"
+    columns = list(table[0])
+    align = [":---" if c in ("set", "protocol") else "---:" for c in columns]
+    body = [[row.get(c, "").replace("*", r"\*") for c in columns] for row in table]
+    lines = ["| " + " | ".join(cells) + " |" for cells in [columns, align, *body]]
+    return "\n".join([*lines, "", *(f"- {note.replace('*', chr(92) + '*')}" for note in notes(results))]) + "\n"
+
+
+def as_dicts(results: Iterable[Result]) -> list[dict[str, Any]]:
+    """Results as plain values: what `results.json` holds and what a tracker logs (`metrics`)."""
+    plain = []
+    for result in results:
+        paper = paper_figures(result) or reported(result.set_name)
+        plain.append(
+            {
+                "set": result.set_name,
+                "protocol_name": result.protocol.name,
+                "protocol": result.protocol.to_dict(),
+                "recalls": {str(k): value for k, value in result.recalls.items()},
+                "metrics": {metric_name(result.set_name, result.protocol, k): v for k, v in result.recalls.items()},
+                "queries": result.queries,
+                "database": result.database,
+                "without_positives": result.without_positives,
+                "remarks": list(result.remarks),
+                "paper": None if paper is None else {"recalls": paper.recalls, "group_size": paper.group_size},
+            }
+        )
+    return plain
+
+
+def write_json(results: Sequence[Result], path: Path, about: dict[str, Any]) -> None:
+    """`{"format_version", **about, "results": [...]}`; `about` says which checkpoint, with its config and digest."""
+    whole = {"format_version": FORMAT_VERSION, **about, "results": as_dicts(results)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(whole, indent=2) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A file of `write_json`. Raises `DataError` for anything else."""
+    try:
+        whole = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: not a results file ({error})") from None
+    if not isinstance(whole, dict) or whole.get("format_version") != FORMAT_VERSION:
+        raise DataError(f"{path}: not a results file of format {FORMAT_VERSION}; evaluate again")
+    return whole
+
+
+def write_csv(results: Sequence[Result], path: Path) -> None:
+    """One line for each set, protocol and N."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        settings = list(results[0].protocol.to_dict()) if results else []
+        writer.writerow(["set", "protocol", "n", "recall", "queries", "database", "no_positive", *settings])
+        for r in results:
+            for k, value in r.recalls.items():
+                counts = [r.queries, r.database, r.without_positives]
+                writer.writerow([r.set_name, r.protocol.name, k, value, *counts, *r.protocol.to_dict().values()])
+
+
+def _by_set(results: Sequence[Result]) -> list[tuple[str, list[Result]]]:
+    groups: dict[str, list[Result]] = {}
+    for result in results:
+        groups.setdefault(result.set_name, []).append(result)
+    return list(groups.items())
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
+
+
+def _cells(paper: Reported | None) -> str:
+    return "-" if paper is None else " / ".join(_percent(value) for value in paper.recalls)

@@ -1,0 +1,1 @@
+"""From descriptors to the nearest database images: exact, approximate, PCA, re-ranking."""

@@ -1,0 +1,1 @@
+"""Evaluation sets: their names, their layouts on disk, and which database images are correct."""

@@ -1,0 +1,305 @@
+"""A searchable index of a user's own photos that grows: what is new is described, the rest is kept.
+
+Invariant: an index is a function of the photos that its sources hold, the weights and the settings, not of how it came
+to be: grown or built at once, it gives the same answers, to the last bit where photos are described one a pass
+(`config.batch` 1). It is replaced by one rename: a build that dies leaves the former index answering, and the next
+build continues behind it. An index knows its weights and protocol, and is refused beside others.
+
+An index is a folder: `described/`, the descriptors of single photos (`kept.py`); `index-<number>/` with `index.faiss`,
+`photos.parquet` (`photo`, relative to `root` of `about.json` where it is below it, `bytes`, `modified`, and `first`,
+`second`, `lat`, `lon`, its coordinates or null), and `pca.safetensors` where PCA was asked for; and `about.json`, which
+names the number: without it there is no index.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import fcntl
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from pipeline.common.errors import DataError, UsageError
+from pipeline.common.files import sync_path, write_atomically
+from pipeline.config import EvaluationConfig
+from pipeline.evaluation.describe.encode import describe_each, evaluating
+from pipeline.evaluation.protocol import Protocol, protocols
+from pipeline.evaluation.search.exact import build_index, load_index, save_index
+from pipeline.evaluation.search.projection import Projection, fit_rows, load_projection, projected, sample_rows
+from pipeline.locate.descriptor_cache import KeptDescriptors
+from pipeline.locate.photos import Photos, find_photos
+
+FORMAT = "place-index 2"
+ABOUT, INDEX, PHOTOS, PCA = "about.json", "index.faiss", "photos.parquet", "pca.safetensors"
+DESCRIBED, LOCK = "described", ".lock"
+
+
+@dataclass(frozen=True)
+class Growth:
+    """What a build changed, in photos."""
+
+    new: int
+    changed: int
+    """Same path, other size or time."""
+    gone: int
+    kept: int
+    described: int
+    """How many went through the model: not those that an earlier, unfinished build had described."""
+
+    def __str__(self) -> str:
+        """One line for people."""
+        line = f"{self.new:,} new, {self.changed:,} changed, {self.gone:,} gone, {self.kept:,} kept"
+        fresh = self.new + self.changed
+        if self.described < fresh:
+            return f"{line}; {fresh - self.described:,} had been described by an earlier build"
+        if self.described > fresh:
+            return f"{line}; {self.described - fresh:,} of these described again: other weights or settings made them"
+        return line
+
+
+@dataclass(frozen=True)
+class PhotoIndex:
+    """A searchable folder of photos."""
+
+    folder: Path
+    index: Any
+    """faiss index, answering with rows of `photos`."""
+    photos: list[Path]
+    positions: np.ndarray | None
+    """float64 [n, 2] in `coordinates`, NaN rows where a photo has none; None where no photo has one."""
+    degrees: np.ndarray | None
+    """Latitude and longitude [n, 2] that UTM positions were made of, where they were."""
+    coordinates: str
+    """utm (east, north in metres), degrees (latitude, longitude), or none."""
+    zone: str
+    """Zone and hemisphere of UTM positions, "31N"; empty where it is not known."""
+    protocol: Protocol
+    projection: Projection | None
+    about: dict[str, Any]
+    growth: Growth | None = None
+    """What the build did that made it; None for an index that was opened."""
+
+
+def make_index(
+    model: nn.Module,
+    sources: Path | Sequence[Path],
+    folder: Path,
+    config: EvaluationConfig,
+    device: torch.device | str,
+    fingerprint: str,
+    about: dict[str, Any] | None = None,
+    progress: bool = True,
+) -> PhotoIndex:
+    """Makes the index in `folder` one of exactly the photos of `sources`, describing those it has not described yet.
+
+    Args:
+        sources: folders of photos, or manifests (`photos.find_photos`).
+        config: its `resize`, `precision`, `search`, `pca` and `pca_whiten` make the index; `batch` and `workers` its
+            speed. A `batch` above 1 may change the rounding of descriptors.
+        fingerprint: identifies the weights (`evaluate.model_fingerprint`).
+        about: more to be kept in `about.json`, such as the checkpoint's path.
+
+    Raises:
+        DataError: no photos, one that does not decode (named), positions in some names only.
+        UsageError: more PCA dimensions than photos; a folder that holds other things, or that another build works in.
+    """
+    sources = [sources] if isinstance(sources, Path) else list(sources)
+    config = dataclasses.replace(config, groups=("single",), store="none", pca_from=None, rerank=0)
+    protocol = protocols(config, int(model.image_size), "none")[0]  # type: ignore[arg-type]
+    photos = find_photos(sources, progress)
+    with _building(folder):
+        former = _former(folder)
+        settings = {"fingerprint": fingerprint, "image_size": protocol.image_size, "resize": protocol.resize}
+        kept = KeptDescriptors(folder / DESCRIBED, {**settings, "precision": protocol.precision})
+        found = kept.find(photos.files, photos.states)
+        missing = [at for at in range(len(photos.files)) if at not in found]
+        growth = _growth(former, photos, len(missing))
+        if missing:
+            paths, rows = [photos.files[at] for at in missing], np.array(missing, np.int64)
+            with evaluating(model):
+                each = describe_each(model, paths, config, torch.device(device), "describing", progress)
+                kept.keep(photos.files, photos.states, ((rows[positions], values) for positions, values in each))
+            found = kept.find(photos.files, photos.states)
+        contents = _contents(photos, protocol, fingerprint)
+        place = _place(folder, former[0]) if former else folder
+        if not former or former[0].get("contents") != contents or not (place / INDEX).is_file():
+            number = 1 + max((int(f.name[6:]) for f in folder.glob("index-*") if f.name[6:].isdigit()), default=-1)
+            place = folder / f"index-{number:06d}"
+            place.mkdir()
+            with tempfile.TemporaryDirectory(dir=folder, prefix=".tmp-") as temporary:
+                blocks = kept.blocks([found[at] for at in range(len(photos.files))], Path(temporary))
+                if protocol.pca:
+                    sample = sample_rows(len(photos.files))
+                    name = f"{', '.join(map(str, sources))}, {len(sample)} of {len(photos.files)} photos"
+                    projection = fit_rows(blocks, sample, protocol.pca, protocol.whiten, name, device)
+                    projection.save(place / PCA)
+                    blocks = projected(blocks, projection)
+                save_index(build_index(blocks, config.search), place / INDEX)
+            _write_photos(photos, place / PHOTOS)
+            for file in [*place.iterdir(), place]:
+                sync_path(file)
+            whole = {
+                "format": FORMAT,
+                "number": number,
+                "fingerprint": fingerprint,
+                "sources": [str(source.absolute()) for source in sources],
+                "root": str(photos.root),
+                "photos": len(photos.files),
+                "coordinates": photos.coordinates,
+                "zone": photos.zone,
+                "protocol": protocol.to_dict(),
+                "bytes": (place / INDEX).stat().st_size,
+                "contents": contents,
+                "remarks": list(photos.remarks),
+                **(about or {}),
+            }
+            write_atomically(folder / ABOUT, (json.dumps(whole, indent=2) + "\n").encode())  # from here on it answers
+        _clean(folder, place)
+        kept.tidy(photos.files, photos.states, found)
+    return dataclasses.replace(open_index(folder, fingerprint), growth=growth)
+
+
+def open_index(folder: Path, fingerprint: str) -> PhotoIndex:
+    """Reads the index of a folder.
+
+    Raises:
+        DataError: there is none, or not all of it.
+        UsageError: it was made with other weights than those of `fingerprint`.
+    """
+    if not (folder / ABOUT).is_file():
+        raise DataError(f"{folder}: no finished index there; make one with --build PHOTOS --index {folder}")
+    before = (folder / ABOUT).read_bytes()
+    try:
+        return _open(folder, fingerprint)
+    except DataError:
+        if (folder / ABOUT).read_bytes() == before:
+            raise
+        return _open(folder, fingerprint)  # a build has replaced it in between
+
+
+def _open(folder: Path, fingerprint: str) -> PhotoIndex:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        about = json.loads((folder / ABOUT).read_text())
+        if about["format"] != FORMAT:
+            raise DataError(f"{folder}: an index of format '{about['format']}', this is '{FORMAT}'; build it again")
+        if about["fingerprint"] != fingerprint:
+            made = f"{about['fingerprint']}{' of ' + about['checkpoint'] if 'checkpoint' in about else ''}"
+            raise UsageError(
+                f"{folder}: made with other weights ({made}) than this checkpoint's ({fingerprint}), their descriptors "
+                "cannot be compared; give that checkpoint, or build the index again"
+            )
+        place = _place(folder, about)
+        table = pq.read_table(place / PHOTOS)
+        root, protocol = Path(about["root"]), Protocol(**about["protocol"])
+        photos = [root / name for name in table["photo"].to_pylist()]
+        pairs = [
+            np.stack([table[name].to_numpy() for name in names], axis=1)
+            for names in (("first", "second"), ("lat", "lon"))
+        ]
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowInvalid) as error:
+        raise DataError(f"{folder}: not a readable index ({error}); build it again") from None
+    positions, degrees = (None if np.isnan(pair).all() else pair for pair in pairs)
+    index = load_index(place / INDEX)
+    if not len(photos) == about["photos"] == index.ntotal:
+        raise DataError(f"{folder}: {index.ntotal} descriptors of {len(photos)} photos; build it again")
+    projection = load_projection(place / PCA) if protocol.pca else None
+    coordinates, zone = about["coordinates"], about["zone"]
+    return PhotoIndex(folder, index, photos, positions, degrees, coordinates, zone, protocol, projection, about)
+
+
+@contextlib.contextmanager
+def _building(folder: Path) -> Iterator[None]:
+    """Holds the folder for one build; refuses a folder that holds other things than an index."""
+    ours = {DESCRIBED, LOCK, "index-*", ".tmp-*"}
+    if folder.is_dir() and not (folder / ABOUT).is_file() and any(
+        not any(entry.match(name) for name in ours) for entry in folder.iterdir()
+    ):  # fmt: skip
+        raise UsageError(f"{folder}: holds other things than an index; give an empty or a new folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK).open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system drops it when its holder dies
+        except BlockingIOError:
+            raise UsageError(f"{folder}: another build works in it; wait for that, or give another folder") from None
+        yield
+
+
+def _former(folder: Path) -> tuple[dict[str, Any], dict[Path, tuple[int, int]]] | None:
+    """(`about.json`, path -> (bytes, time) of its photos) of the index there; None where there is none to be read."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    if not (folder / ABOUT).is_file():
+        return None
+    try:
+        about = json.loads((folder / ABOUT).read_text())
+        ours = str(about["format"]).startswith("place-index")
+    except (OSError, ValueError, KeyError, TypeError):
+        ours = False
+    if not ours:
+        raise UsageError(f"{folder}: its {ABOUT} is not that of an index; give an empty or a new folder")
+    try:
+        table = pq.read_table(_place(folder, about) / PHOTOS).to_pydict()
+        states = zip(table["bytes"], table["modified"], strict=True)
+        return about, {Path(about["root"]) / name: state for name, state in zip(table["photo"], states, strict=True)}
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowInvalid):
+        return None  # of an older format, or damaged: it is built anew
+
+
+def _growth(
+    former: tuple[dict[str, Any], dict[Path, tuple[int, int]]] | None, photos: Photos, described: int
+) -> Growth:
+    old = former[1] if former else {}
+    states = dict(zip(photos.files, map(tuple, photos.states.tolist()), strict=True))
+    both = old.keys() & states.keys()
+    kept = sum(old[photo] == states[photo] for photo in both)
+    return Growth(len(states) - len(both), len(both) - kept, len(old) - len(both), kept, described)
+
+
+def _contents(photos: Photos, protocol: Protocol, fingerprint: str) -> str:
+    """Sixteen hex digits of all that the index is made of."""
+    settings = [FORMAT, fingerprint, protocol.to_dict(), photos.zone, photos.coordinates]
+    seen = hashlib.sha256(json.dumps(settings).encode())
+    seen.update("\n".join(map(str, photos.files)).encode())
+    for array in (photos.states, photos.positions, photos.degrees):
+        seen.update(b"|" if array is None else np.ascontiguousarray(array).tobytes())
+    return seen.hexdigest()[:16]
+
+
+def _write_photos(photos: Photos, file: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    names = [str(p.relative_to(photos.root) if p.is_relative_to(photos.root) else p) for p in photos.files]
+    table = {"photo": names, "bytes": photos.states[:, 0], "modified": photos.states[:, 1]}
+    empty = np.full((len(names), 2), np.nan)
+    for (first, second), pair in ((("first", "second"), photos.positions), (("lat", "lon"), photos.degrees)):
+        values = empty if pair is None else pair
+        table[first], table[second] = (pa.array(values[:, i], from_pandas=True) for i in (0, 1))  # NaN is null
+    pq.write_table(pa.table(table), file)
+
+
+def _place(folder: Path, about: dict[str, Any]) -> Path:
+    return folder / f"index-{int(about['number']):06d}"
+
+
+def _clean(folder: Path, place: Path) -> None:
+    """Removes former indexes, what killed builds left, and the files of the first format."""
+    for left in [*folder.glob("index-*"), *folder.glob(".tmp-*")]:
+        if left != place:
+            shutil.rmtree(left)
+    for name in (INDEX, PHOTOS, PCA):
+        (folder / name).unlink(missing_ok=True)

@@ -1,0 +1,1 @@
+"""Weights in and out: our files, released files of others, conversion, ONNX."""

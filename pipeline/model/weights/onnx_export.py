@@ -1,0 +1,129 @@
+"""The per-image path as an ONNX file, checked by onnxruntime against torch before it is put in its place.
+
+Invariant: what is exported does not look across images. `regions` is `encode`, which never does. `descriptors` is the
+whole model with every image as a group of its own (`groups: single`), at any batch: the cross-image encoder's layers
+are shared by the regions and know no positions, so b images alone are one image with b*R regions, and that is exact.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import logging
+import tempfile
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from pipeline.common.errors import DataError, UsageError
+from pipeline.config import to_dict
+from pipeline.data.images import MEAN, STD
+from pipeline.model.vpr import PlaceModel
+
+Output = Literal["descriptors", "regions"]
+PACKAGES = ("onnx", "onnxruntime", "onnxscript")
+TOLERANCE = 1e-4  # of the largest value; float32 with another order of sums stays a hundred times below
+
+
+class PerImage(nn.Module):
+    """images [b, 3, S, S], normalised -> regions [b, R, D], or descriptors [b, R*D] with each image alone."""
+
+    def __init__(self, model: PlaceModel, output: Output) -> None:
+        super().__init__()
+        self.model, self.output = model, output
+
+    def forward(self, images: Tensor) -> Tensor:
+        """[b, 3, S, S] -> [b, R, D] or [b, R*D]."""
+        regions = self.model.encode(images)
+        if self.output == "regions":
+            return regions
+        alone = self.model.cross_image(regions.flatten(0, 1)[None])
+        return F.normalize(alone.view_as(regions).flatten(1), dim=-1)
+
+
+def export_onnx(model: PlaceModel, path: Path, output: Output = "descriptors") -> float:
+    """Writes the ONNX file (above 2 GB its tensors go beside it, in `<name>.data`); returns the largest difference.
+
+    The input is `images`, float32 [batch, 3, S, S], ImageNet-normalised; the file's metadata holds the config, the
+    image size, mean and standard deviation.
+
+    Raises:
+        UsageError: the packages of the extra `onnx` are missing.
+        DataError: onnxruntime's result is not torch's; nothing is written then.
+    """
+    absent = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
+    if absent:
+        raise UsageError(f"ONNX export needs {', '.join(absent)}: pip install 'place-recognition-training[onnx]'")
+    model = model.float().cpu().eval()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".partial-") as folder:
+        file = Path(folder) / path.name
+        _write(model, file, output)
+        difference = check(model, file, output)
+        for written in sorted(Path(folder).iterdir(), key=lambda f: f == file):  # the model itself comes last
+            written.replace(path.parent / written.name)
+    return difference
+
+
+def _write(model: PlaceModel, file: Path, output: Output) -> None:
+    per_image = PerImage(model, output).eval()
+    batch = torch.export.Dim("batch", min=1)
+    example = torch.zeros(2, 3, model.image_size, model.image_size)
+    with _quiet(), torch.no_grad():
+        graph = torch.export.export(per_image, (example,), dynamic_shapes={"images": {0: batch}})
+        program: Any = torch.onnx.export(
+            graph, (), None, input_names=["images"], output_names=[output], dynamo=True, verbose=False
+        )
+    program.model.metadata_props.update(
+        {
+            "config": json.dumps(to_dict(model.config)),
+            "image_size": str(model.image_size),
+            "normalisation": json.dumps({"scale": 255, "mean": MEAN, "std": STD}),
+            "groups": "single" if output == "descriptors" else "none: encode alone",
+        }
+    )
+    program.save(file)
+
+
+def check(model: PlaceModel, file: Path, output: Output) -> float:
+    """The largest difference between onnxruntime and torch, on one image and on three; torch takes them one by one.
+
+    Raises:
+        DataError: it is above `TOLERANCE` of the largest value.
+    """
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    generator = torch.Generator().manual_seed(0)
+    worst = 0.0
+    for count in (1, 3):
+        images = torch.randn(count, 3, model.image_size, model.image_size, generator=generator)
+        one = model.encode if output == "regions" else model
+        with torch.no_grad():
+            wanted = torch.cat([one(image[None]) for image in images])
+        found = torch.from_numpy(session.run([output], {"images": images.numpy()})[0])
+        difference = float((found - wanted).abs().max()) if found.shape == wanted.shape else float("inf")
+        if not difference <= TOLERANCE * float(wanted.abs().max()):
+            raise DataError(f"{file.name}: onnxruntime differs from torch by {difference:.1e}; the file was not kept")
+        worst = max(worst, difference)
+    return worst
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the exporter's remarks on packages that are not installed and on its own innards."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)

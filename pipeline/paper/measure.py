@@ -1,0 +1,78 @@
+"""Everything that a table asks of one trained run, in one go: the model is loaded once, images are described once.
+
+Invariant: collective, with the same results on any number of processes; an evaluation that is on disk already is not
+repeated, one that was cut short leaves nothing half-written.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import EvaluationConfig, from_dict, to_dict
+from pipeline.evaluation.evaluate import Result, evaluate, fit_projections, model_fingerprint
+from pipeline.evaluation.report import tables
+from pipeline.evaluation.sets.load import load_set
+from pipeline.model.weights.files import checkpoint_file, load_model, read_metadata
+from pipeline.paper.plan import Cell
+
+
+def folder(run: Path) -> Path:
+    """Where a run's results for tables lie, one JSON an evaluation."""
+    return run / "tables"
+
+
+def results_file(run: Path, cell: Cell) -> Path:
+    """The results of one evaluation."""
+    return folder(run) / f"{cell.key}.json"
+
+
+def write_order(run: Path, cells: Sequence[Cell]) -> Path:
+    """The evaluations to do, as a file for `measure`."""
+    path = folder(run) / "order.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    orders = {cell.key: to_dict(cell.config) for cell in cells}
+    path.write_text(json.dumps({"run": str(run), "evaluations": orders}, indent=1) + "\n")
+    return path
+
+
+def measure(order: Path, accelerator: Any) -> None:
+    """Evaluates what `order` lists and writes each result; rank 0 also records the recalls in the run's MLflow run.
+
+    Raises:
+        DataError, UsageError: a set or the run's model cannot be read; the same on all ranks.
+    """
+    told = json.loads(order.read_text())
+    run = Path(told["run"])
+    file, output = checkpoint_file(run), folder(run)
+    model = load_model(file, accelerator.device)
+    fingerprint = model_fingerprint(model)
+    configs = {key: from_dict(EvaluationConfig, values) for key, values in told["evaluations"].items()}
+    for key, config in configs.items():
+        projections = None
+        if config.pca and config.pca_from:
+            source = load_set(config.pca_from, dataclasses.replace(config, split="train"))
+            projections = fit_projections(
+                model, source, config, accelerator.device, beside=file.parent, fingerprint=fingerprint
+            )
+        sets = [load_set(name, config) for name in config.sets]
+        results = evaluate(model, sets, config, accelerator.device, output, True, projections, fingerprint)
+        if accelerator.is_main_process:
+            _keep(run, output / f"{key}.json", file, config, results)
+    if accelerator.is_main_process:
+        # descriptors were kept only so that several PCAs need not describe the images again
+        shutil.rmtree(output / "descriptors", ignore_errors=True)
+
+
+def _keep(run: Path, path: Path, file: Path, config: EvaluationConfig, results: Sequence[Result]) -> None:
+    from pipeline.training.tracking import record_evaluation
+
+    temporary = path.with_suffix(".part")
+    tables.write_json(results, temporary, {"checkpoint": str(file), "evaluation": to_dict(config)})
+    values = {name: value for entry in tables.as_dicts(results) for name, value in entry["metrics"].items()}
+    record_evaluation(run, read_metadata(file)["extra"], values, path.parent)
+    temporary.replace(path)

@@ -1,0 +1,133 @@
+"""How far an engine is from one process: three steps on the same small global batches, whole tensors out.
+
+Invariant: the batches, the weights they start from and the steps are functions of nothing but the code, dropout is 0,
+every rank has different images, and the optimiser is plain SGD, which does not hide a wrong scale as Adam does. So
+whatever the launch, the answers may differ by rounding alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, TrainConfig
+from pipeline.distributed import rank_slice
+from pipeline.model.vpr import build_model
+from pipeline.training.engines.build import build_engine
+from pipeline.training.loss import MultiSimilarityLoss
+
+MODEL = ModelConfig(
+    backbone=BackboneConfig(name="custom", dim=32, depth=2, heads=2, patch=14, pretrain_grid=4),
+    adapter=AdapterConfig(reduced=4),
+    cross_image=CrossImageConfig(layers=2, heads=4, feedforward=48, dropout=0.0),
+    train="full",
+)
+Train = Literal["adapters", "full", "frozen", "last"]
+PLACES, VIEWS, SIZE, STEPS, RATE = 8, 4, 56, 3, 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """Largest difference between two sets of tensors.
+
+    Attributes:
+        gradient: of the first step's gradients, relative to each tensor's norm; the largest tensor's.
+        tensor: which tensor that is.
+        weight: of the weights after three steps, relative to the largest change that the steps made.
+        tensors: how many were compared.
+    """
+
+    gradient: float
+    tensor: str
+    weight: float
+    tensors: int
+
+
+def batches(dtype: torch.dtype) -> list[Tensor]:
+    """The global batches: three of [32, 3, 56, 56], noisy views of eight places, so that mining finds pairs."""
+    generator = torch.Generator().manual_seed(5)
+    places = torch.randn(PLACES, 1, 3, SIZE, SIZE, generator=generator, dtype=torch.float64)
+    noise = torch.randn(STEPS, PLACES, VIEWS, 3, SIZE, SIZE, generator=generator, dtype=torch.float64)
+    return [(0.3 * places + n).reshape(PLACES * VIEWS, 3, SIZE, SIZE).to(dtype) for n in noise]
+
+
+def measure(accelerator: Any, config: TrainConfig, dtype: torch.dtype, train: Train = "full") -> dict[str, Tensor]:
+    """Three SGD steps under this launch's engine (collective).
+
+    Args:
+        accelerator: from `launch.start`.
+        config: `engine` and `encode_chunk` are used.
+        dtype: of weights and images.
+        train: `ModelConfig.train`.
+
+    Returns:
+        On rank 0 `start/<name>`, `gradient/<name>` (first batch, averaged over ranks), `weight/<name>` (after the
+        steps, buffers too); {} elsewhere.
+    """
+    torch.manual_seed(3)
+    model = build_model(dataclasses.replace(MODEL, train=train), SIZE)
+    for adapter in model.backbone.adapters():  # they start at a zero output; give them one, so that all parts matter
+        for parameter in adapter.parameters():
+            torch.nn.init.normal_(parameter, std=0.1)
+    model = model.to(dtype).train()
+    start = {f"start/{name}": tensor.clone() for name, tensor in model.state_dict().items()}
+    micro = len(batches(dtype)[0][rank_slice(PLACES * VIEWS)])
+    engine = build_engine(config, accelerator, model, _sgd, micro)
+    loss_function = MultiSimilarityLoss()
+    labels = torch.arange(PLACES).repeat_interleave(VIEWS)
+    mine = rank_slice(PLACES * VIEWS)
+
+    def loss(images: Tensor) -> Tensor:
+        part = images[mine].to(accelerator.device)
+        with accelerator.autocast():
+            descriptors = engine(part, chunk=config.encode_chunk)
+        value: Tensor = loss_function(descriptors, labels[mine].to(accelerator.device))
+        return value
+
+    data = batches(dtype)
+    engine.model.train()
+    gradients = engine.gradients(loss(data[0]))
+    for images in data:
+        engine.step(loss(images), RATE)
+    weights, _ = engine.state(list(engine.model.state_dict()))
+    if not weights:
+        return {}
+    return {
+        **start,
+        **{f"gradient/{name}": tensor for name, tensor in gradients.items()},
+        **{f"weight/{name}": tensor for name, tensor in weights.items()},
+    }
+
+
+def _sgd(parameters: Any) -> torch.optim.Optimizer:
+    return torch.optim.SGD([p for p in parameters if p.requires_grad], lr=RATE)
+
+
+def compare(truth: dict[str, Tensor], found: dict[str, Tensor]) -> Difference:
+    """How far `found` is from `truth`, both from `measure`.
+
+    A tensor whose true gradient is zero (a bias in front of BatchNorm, or on attention keys) is measured against the
+    largest gradient of all, for its own norm is rounding.
+
+    Raises:
+        ValueError: they do not hold the same tensors.
+    """
+    if truth.keys() != found.keys():
+        raise ValueError(f"not the same tensors: {sorted(truth.keys() ^ found.keys())[:3]}")
+    gradients = [name for name in truth if name.startswith("gradient/")]
+    largest = max(truth[name].double().norm().item() for name in gradients)
+    worst, where = 0.0, ""
+    for name in gradients:
+        norm = truth[name].double().norm().item()
+        scale = norm if norm > 1e-6 * largest else largest
+        difference = (truth[name].double() - found[name].double()).norm().item() / scale
+        if difference >= worst:
+            worst, where = difference, name.removeprefix("gradient/")
+    floats = [name.removeprefix("weight/") for name in truth if name.startswith("weight/")]
+    floats = [name for name in floats if truth[f"weight/{name}"].is_floating_point()]
+    moved = max((truth[f"weight/{n}"].double() - truth[f"start/{n}"].double()).abs().max().item() for n in floats)
+    apart = max((truth[f"weight/{n}"].double() - found[f"weight/{n}"].double()).abs().max().item() for n in floats)
+    return Difference(worst, where, apart / moved, len(gradients))

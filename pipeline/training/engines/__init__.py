@@ -1,0 +1,1 @@
+"""Ways to wrap the model for training: one process and DDP, FSDP2, DeepSpeed ZeRO."""
