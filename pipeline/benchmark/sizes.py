@@ -47,7 +47,7 @@ SIZES: dict[str, Size] = {
             backbone=BackboneConfig(name="custom", dim=192, depth=4, heads=3, patch=14, pretrain_grid=8),
             adapter=AdapterConfig(reduced=12),
             cross_image=CrossImageConfig(layers=2, heads=8, feedforward=384, dropout=0.0),
-            train="full",
+            trainable="full",
         ), 112, 32, 288, 16, 36,
     ),
     "vitb": Size(ModelConfig(cross_image=CrossImageConfig(dropout=0.0)), 224, 8, 72, 4, 8),
@@ -56,7 +56,7 @@ SIZES: dict[str, Size] = {
             backbone=BackboneConfig(name="custom", dim=32, depth=2, heads=2, patch=14, pretrain_grid=4),
             adapter=AdapterConfig(reduced=4),
             cross_image=CrossImageConfig(layers=1, heads=4, feedforward=48, dropout=0.0),
-            train="full",
+            trainable="full",
         ), 56, 8, 8, 2, 2,
     ),
 }  # fmt: skip

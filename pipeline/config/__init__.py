@@ -136,7 +136,7 @@ class TrainConfig:
     """schedule=step: factor of a reduction (paper: 0.5)."""
     warmup_steps: int = 0
     """Linear warm-up in steps (published: 0)."""
-    clip: float | None = None
+    max_grad_norm: float | None = None
     """Largest norm of the gradient; none: no clipping (published: none)."""
     validate_first: bool = True
     """Evaluate the untrained model before the first step, so that a run shows what training added."""

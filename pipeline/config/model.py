@@ -136,7 +136,7 @@ class ModelConfig:
     """Regional features."""
     cross_image: CrossImageConfig = field(default_factory=CrossImageConfig)
     """The cross-image encoder."""
-    train: Literal["adapters", "full", "frozen", "last"] = "adapters"
+    trainable: Literal["adapters", "full", "frozen", "last"] = "adapters"
     """What of the backbone is trained: its adapters (paper), all of it, nothing, or the last blocks."""
     last_blocks: int = 4
-    """train=last: how many blocks (of a residual network: stages) at the end are trained."""
+    """trainable=last: how many blocks (of a residual network: stages) at the end are trained."""

@@ -15,7 +15,7 @@ from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig
 
 NO_CRICA: dict[str, Any] = {"cross_image.layers": 0}
-FROZEN: dict[str, Any] = {"adapter.kind": "none", "train": "frozen"}
+FROZEN: dict[str, Any] = {"adapter.kind": "none", "trainable": "frozen"}
 GEM: dict[str, Any] = {"pooling.kind": "gem"}
 SPMG: dict[str, Any] = {"pooling.kind": "spmg"}
 
@@ -34,7 +34,7 @@ PAPER: dict[str, dict[str, Any]] = {
     "AdaptSPM+Crica": {},
     # ablation on adaptation: SPM with the cross-image encoder unless the name says GeM
     "FrozenDINOv2": FROZEN,
-    "FullTunedDINOv2": {"adapter.kind": "none", "train": "full"},
+    "FullTunedDINOv2": {"adapter.kind": "none", "trainable": "full"},
     "VanillaAdapter": {"adapter.kind": "vanilla"},
     "ConvAdapter": {"adapter.kind": "conv"},
     "MulConvAdapter": {},
@@ -51,13 +51,13 @@ PAPER: dict[str, dict[str, Any]] = {
 
 def _resnet(cut: str, trained: int) -> dict[str, Any]:
     """ResNet-50 up to a stage, of which the last `trained` stages are trained; no cross-image encoder."""
-    tuned: dict[str, Any] = {"adapter.kind": "none", "train": "last", "last_blocks": trained}
+    tuned: dict[str, Any] = {"adapter.kind": "none", "trainable": "last", "last_blocks": trained}
     return tuned | NO_CRICA | {"backbone.name": "resnet50", "backbone.resnet.cut": cut}
 
 
 def _dinov2(trained: int) -> dict[str, Any]:
     """The paper's backbone, of which the last blocks are trained instead of adapters; no cross-image encoder."""
-    return NO_CRICA | {"adapter.kind": "none", "train": "last", "last_blocks": trained}
+    return NO_CRICA | {"adapter.kind": "none", "trainable": "last", "last_blocks": trained}
 
 
 def _pool(kind: str, **fields: Any) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 from pipeline.evaluation.protocol import Protocol
 from pipeline.evaluation.report.figures import CURVES, DPI, GREY, INK, STYLE
 from pipeline.evaluation.report.paper_numbers import Reported
-from pipeline.paper import table_report
+from pipeline.paper import values
 from pipeline.paper.study import Study
 
 COLOURS = dict(zip(("single", "shuffled", "ordered"), CURVES, strict=False))
@@ -45,14 +45,14 @@ def draw(study: Study, path: Path) -> None:
 
 def _bars(panel: Any, study: Study, set_name: str) -> None:
     """Horizontal bars, one for each grouping of a row; a dot a seed; a hollow diamond for the paper."""
-    loaded, protocols = study.sets[set_name], table_report.by_row(study, set_name)
+    loaded, protocols = study.sets[set_name], values.by_row(study, set_name)
     groupings = _groupings(protocols)
     thick = 0.78 / max(1, len(groupings))
     rows = list(study.table.rows)
     for place, row in enumerate(rows):
         for number, g in enumerate(groupings):
             protocol = protocols.get(row, {}).get(g)
-            found = None if protocol is None else table_report.value(study, row, loaded, protocol, 1)
+            found = None if protocol is None else values.value(study, row, loaded, protocol, 1)
             if found is None:
                 continue
             y = place + (number - (len(groupings) - 1) / 2) * thick
@@ -63,7 +63,7 @@ def _bars(panel: Any, study: Study, set_name: str) -> None:
             panel.annotate(
                 f"{found.mean:.1f}", (end, y), (5, 0), textcoords="offset points", va="center", fontsize=7.5, color=GREY
             )
-        figure = table_report.paper_figure(study, row, loaded)
+        figure = values.paper_figure(study, row, loaded)
         if figure is not None and figure.at(1) is not None:
             style = {"s": 46, "marker": "D", "facecolor": "white", "edgecolor": INK, "lw": 1.3, "zorder": 4}
             panel.scatter(figure.at(1), place, label=_theirs(study, set_name), **style)
@@ -74,7 +74,7 @@ def _bars(panel: Any, study: Study, set_name: str) -> None:
 
 def _lines(panel: Any, study: Study, set_name: str) -> None:
     """Recall@1 over the rows' numbers, a line for each grouping and series; the paper's dashed."""
-    loaded, protocols = study.sets[set_name], table_report.by_row(study, set_name)
+    loaded, protocols = study.sets[set_name], values.by_row(study, set_name)
     if study.table.logarithmic:
         panel.set_xscale("log")
     for number, ending in enumerate(study.table.series or ("",)):
@@ -86,7 +86,7 @@ def _lines(panel: Any, study: Study, set_name: str) -> None:
             points = []
             for row, at in rows.items():
                 protocol = protocols.get(row, {}).get(g)
-                found = None if protocol is None else table_report.value(study, row, loaded, protocol, 1)
+                found = None if protocol is None else values.value(study, row, loaded, protocol, 1)
                 if found is not None:
                     points.append((at, found.mean, found.deviation or 0.0))
             if points:
@@ -94,7 +94,7 @@ def _lines(panel: Any, study: Study, set_name: str) -> None:
                 colour = COLOURS[g] if number == len(study.table.series or ("",)) - 1 else _lighter(COLOURS[g])
                 label = _label(g, protocols) + named
                 panel.errorbar(x, mean, deviation if any(deviation) else None, color=colour, label=label, **style)
-        theirs = _points(rows, lambda row: table_report.paper_figure(study, row, loaded))
+        theirs = _points(rows, lambda row: values.paper_figure(study, row, loaded))
         if theirs:
             label = _theirs(study, set_name) + named
             dashed = {"ls": "--", "marker": "os"[number % 2], "ms": 5, "mfc": "white", "color": INK, "lw": 1.2}
@@ -131,7 +131,7 @@ def _label(grouping: str, protocols: Mapping[str, Mapping[str, Protocol]]) -> st
 
 
 def _theirs(study: Study, set_name: str) -> str:
-    return f"paper, {table_report.paper_set(study, study.sets[set_name])}, ordered"
+    return f"paper, {values.paper_set(study, study.sets[set_name])}, ordered"
 
 
 def _lighter(colour: str) -> Any:

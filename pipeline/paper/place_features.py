@@ -85,10 +85,10 @@ def pretrained(model: torch.nn.Module) -> Iterator[None]:
         UsageError: the backbone itself was trained, so the released one is not in it.
     """
     config: Any = model.config
-    if config.train not in ("adapters", "frozen"):
+    if config.trainable not in ("adapters", "frozen"):
         raise UsageError(
-            f"the model's backbone was trained itself (model.train {config.train}), so its pre-trained state is not in "
-            "it; give it as --baseline: released weights or another run"
+            f"the model's backbone was trained itself (model.trainable {config.trainable}), so its pre-trained state is not "
+            "in it; give it as --baseline: released weights or another run"
         )
     adapted = [module for module in model.modules() if isinstance(module, AdaptedMLP)]
     scales = [module.scale for module in adapted]

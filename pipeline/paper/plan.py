@@ -185,7 +185,7 @@ def _model(row: Row, base: ModelConfig, resnet_weights: str | None) -> ModelConf
         model = dataclasses.replace(
             model, backbone=dataclasses.replace(model.backbone, name=name, weights=resnet_weights)
         )
-    elif model.backbone.name == "custom" and model.train == "last" and base.train != "last":
+    elif model.backbone.name == "custom" and model.trainable == "last" and base.trainable != "last":
         model = dataclasses.replace(model, last_blocks=last_blocks(model.backbone.depth, model.last_blocks))
     return model
 

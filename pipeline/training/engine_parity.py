@@ -23,9 +23,9 @@ MODEL = ModelConfig(
     backbone=BackboneConfig(name="custom", dim=32, depth=2, heads=2, patch=14, pretrain_grid=4),
     adapter=AdapterConfig(reduced=4),
     cross_image=CrossImageConfig(layers=2, heads=4, feedforward=48, dropout=0.0),
-    train="full",
+    trainable="full",
 )
-Train = Literal["adapters", "full", "frozen", "last"]
+Trainable = Literal["adapters", "full", "frozen", "last"]
 PLACES, VIEWS, SIZE, STEPS, RATE = 8, 4, 56, 3, 0.1
 
 
@@ -54,21 +54,23 @@ def batches(dtype: torch.dtype) -> list[Tensor]:
     return [(0.3 * places + n).reshape(PLACES * VIEWS, 3, SIZE, SIZE).to(dtype) for n in noise]
 
 
-def measure(accelerator: Any, config: TrainConfig, dtype: torch.dtype, train: Train = "full") -> dict[str, Tensor]:
+def measure(
+    accelerator: Any, config: TrainConfig, dtype: torch.dtype, trainable: Trainable = "full"
+) -> dict[str, Tensor]:
     """Three SGD steps under this launch's engine (collective).
 
     Args:
         accelerator: from `launch.start`.
         config: `engine` and `encode_chunk` are used.
         dtype: of weights and images.
-        train: `ModelConfig.train`.
+        trainable: `ModelConfig.trainable`.
 
     Returns:
         On rank 0 `start/<name>`, `gradient/<name>` (first batch, averaged over ranks), `weight/<name>` (after the
         steps, buffers too); {} elsewhere.
     """
     torch.manual_seed(3)
-    model = build_model(dataclasses.replace(MODEL, train=train), SIZE)
+    model = build_model(dataclasses.replace(MODEL, trainable=trainable), SIZE)
     for adapter in model.backbone.adapters():  # they start at a zero output; give them one, so that all parts matter
         for parameter in adapter.parameters():
             torch.nn.init.normal_(parameter, std=0.1)

@@ -168,7 +168,7 @@ class Trainer:
         if not math.isfinite(value):
             raise Diverged(
                 f"the loss is {value} at step {state.step} (epoch {state.epoch}); the last good checkpoint of "
-                f"{self.run} stays; try a smaller --train.lr, --train.clip 1.0 or --train.warmup_steps 500"
+                f"{self.run} stays; try a smaller --train.lr, --train.max_grad_norm 1.0 or --train.warmup_steps 500"
             )
         rate = learning_rate(config.train, state.step, self.steps_per_epoch, self.total_steps)
         self.engine.step(loss, rate)

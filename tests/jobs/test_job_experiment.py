@@ -184,9 +184,9 @@ def test_same_settings_share_a_training_and_others_never_do() -> None:
 
 
 def test_values_show_mean_and_spread_over_seeds(root: Path) -> None:
-    one = table_report.Value((50.0, 54.0, 58.0))
+    one = values.Value((50.0, 54.0, 58.0))
     assert (one.mean, one.deviation, str(one)) == (54.0, pytest.approx(np.std([50, 54, 58], ddof=1)), "54.0 ±4.0")
-    assert str(table_report.Value((50.0,))) == "50.0"
+    assert str(values.Value((50.0,))) == "50.0"
     filled = built(root, "kernels", (0, 1))
     name = next(iter(filled.sets.values())).name
     filled.values["5x5", name, "ordered16"] = {1: [40.0, 44.0], 5: [80.0, 80.0]}

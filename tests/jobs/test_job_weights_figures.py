@@ -82,7 +82,7 @@ def start(job: object, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None
 
 @pytest.mark.parametrize(
     "words",
-    [  # the exporter takes its time; tests/pipeline/model/test_model_exchange.py runs it by default
+    [  # the exporter takes its time; tests/pipeline/model/weights/test_weights_convert.py runs it by default
         pytest.param(words, id=words[-1], marks=[pytest.mark.slow] if words[-1].endswith(".onnx") else [])
         for words in commands("weights.md", "jobs.weights")
     ],

@@ -61,7 +61,7 @@ def run_settings(root: Path) -> dict[str, Any]:
             "backbone": {"name": "custom", "dim": 16, "depth": 2, "heads": 2, "patch": 7, "pretrain_grid": 4},
             "adapter": {"reduced": 4},
             "cross_image": {"layers": 1, "heads": 2, "feedforward": 16, "dropout": 0.1},
-            "train": "full",
+            "trainable": "full",
         },
         "train": {"epochs": 2, "lr": 1e-3, "patience": 0, "save_every": 2, "log_every": 1, "log_samples": True},
         "validate": {"sets": [str(root / "evaluation")], "split": "val", "groups": ["shuffled"], "group_size": 4,

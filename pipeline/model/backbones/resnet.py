@@ -104,12 +104,12 @@ def check_trained(config: ModelConfig, stages: int) -> None:
     Raises:
         UsageError: adapters, or more last stages than there are.
     """
-    if config.train == "adapters" or config.adapter.kind != "none":
+    if config.trainable == "adapters" or config.adapter.kind != "none":
         raise UsageError(
             f"adapters belong to transformer blocks and backbone {config.backbone.name} has none: set "
-            "model.adapter.kind none and model.train full, last or frozen"
+            "model.adapter.kind none and model.trainable full, last or frozen"
         )
-    if config.train == "last" and not 1 <= config.last_blocks <= stages:
+    if config.trainable == "last" and not 1 <= config.last_blocks <= stages:
         raise UsageError(f"model.last_blocks {config.last_blocks} must lie between 1 and the {stages} stages used")
 
 
@@ -150,7 +150,7 @@ class ResNet(nn.Module):
             from pipeline.model.weights.pretrained import load_resnet
 
             load_resnet(self, backbone.weights, backbone.name)
-        self.trained = {"full": self.depth + 1, "frozen": 0}.get(config.train, config.last_blocks)
+        self.trained = {"full": self.depth + 1, "frozen": 0}.get(config.trainable, config.last_blocks)
         for module in self._frozen():
             module.requires_grad_(False)
 

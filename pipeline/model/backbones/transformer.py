@@ -151,7 +151,7 @@ class Backbone(nn.Module):
         size = sizes(config.backbone)
         if image_size % size.patch or image_size < size.patch:
             raise UsageError(f"data.image_size {image_size} is not a multiple of the backbone's patch {size.patch}")
-        if config.train == "last" and not 1 <= config.last_blocks <= size.depth:
+        if config.trainable == "last" and not 1 <= config.last_blocks <= size.depth:
             raise UsageError(f"model.last_blocks {config.last_blocks} must lie between 1 and the depth {size.depth}")
         self.dim, self.depth, self.grid = size.dim, size.depth, image_size // size.patch
         self.registers, self.rope, self.final_norm = size.registers, size.rope, config.backbone.final_norm
@@ -178,10 +178,10 @@ class Backbone(nn.Module):
         A frozen adapter would add nothing for ever, its last Linear being zero, so frozen blocks get none. The mask
         token is never trained: it takes part in nothing, and DDP wants no idle trainable parameter.
         """
-        last = {"adapters": self.depth, "full": self.depth, "frozen": 0, "last": config.last_blocks}[config.train]
-        self.requires_grad_(config.train == "full")
+        last = {"adapters": self.depth, "full": self.depth, "frozen": 0, "last": config.last_blocks}[config.trainable]
+        self.requires_grad_(config.trainable == "full")
         self.vit.embeddings.mask_token.requires_grad_(False)
-        if config.train == "last":
+        if config.trainable == "last":
             for module in (*self.blocks[self.depth - last :], self.vit.norm if self.rope else self.vit.layernorm):
                 module.requires_grad_(True)
         if config.adapter.kind != "none":

@@ -81,7 +81,7 @@ class VGG(nn.Module):
             from pipeline.model.weights.pretrained import load_vgg
 
             load_vgg(self, backbone.weights, backbone.name)
-        trained = {"full": self.depth, "frozen": 0}.get(config.train, config.last_blocks)
+        trained = {"full": self.depth, "frozen": 0}.get(config.trainable, config.last_blocks)
         for stage in self.blocks[: self.depth - trained]:
             stage.requires_grad_(False)
 

@@ -169,7 +169,7 @@ def write_backbone(source: str, config: BackboneConfig, path: Path) -> dict[str,
 def _checked(source: str, config: BackboneConfig) -> dict[str, Tensor]:
     """The backbone's tensors under release names, after they were loaded into the backbone of `config`."""
     size = 16 * 14  # any multiple of every patch: the stored tensors do not depend on it
-    plain = ModelConfig(backbone=dataclasses.replace(config, weights=source), train="frozen")
+    plain = ModelConfig(backbone=dataclasses.replace(config, weights=source), trainable="frozen")
     plain = dataclasses.replace(
         plain,
         adapter=dataclasses.replace(plain.adapter, kind="none"),

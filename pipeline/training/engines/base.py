@@ -27,7 +27,7 @@ class Engine:
         accelerator: owns device, precision and wrapping.
         model: on the CPU, identical on all ranks; afterwards `self.model`, inside its wrapper `self.module`.
         build: makes the optimiser over the parameters of the module it is given.
-        clip: largest gradient norm, or None.
+        max_grad_norm: largest gradient norm, or None.
     """
 
     name = "ddp"
@@ -37,9 +37,9 @@ class Engine:
         accelerator: Any,
         model: PlaceModel,
         build: BuildOptimizer,
-        clip: float | None,
+        max_grad_norm: float | None,
     ) -> None:
-        self.accelerator, self.clip = accelerator, clip
+        self.accelerator, self.max_grad_norm = accelerator, max_grad_norm
         self._wrap(model, build)
 
     def _wrap(self, model: PlaceModel, build: BuildOptimizer) -> None:
@@ -59,8 +59,8 @@ class Engine:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.accelerator.backward(loss)
-        if self.clip is not None:
-            self.accelerator.clip_grad_norm_(self.module.parameters(), self.clip)
+        if self.max_grad_norm is not None:
+            self.accelerator.clip_grad_norm_(self.module.parameters(), self.max_grad_norm)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 

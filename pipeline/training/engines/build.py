@@ -60,9 +60,9 @@ def build_engine(
     """
     chosen = choose(config.engine)
     if chosen == "deepspeed":
-        return ZeroEngine(accelerator, model, build, config.clip, micro_batch)
+        return ZeroEngine(accelerator, model, build, config.max_grad_norm, micro_batch)
     if chosen == "fsdp2":
         if accelerator.mixed_precision == "fp16":
             raise UsageError("engine fsdp2 has no loss scaler for fp16; use bf16, or DDP")
-        return ShardedEngine(accelerator, model, build, config.clip)
-    return Engine(accelerator, model, build, config.clip)
+        return ShardedEngine(accelerator, model, build, config.max_grad_norm)
+    return Engine(accelerator, model, build, config.max_grad_norm)

@@ -45,8 +45,8 @@ class ShardedEngine(Engine):
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         loss.backward()
-        if self.clip is not None:
-            torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.clip)  # norm over all shards
+        if self.max_grad_norm is not None:
+            torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.max_grad_norm)  # norm over all shards
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 

@@ -31,7 +31,7 @@ class ZeroEngine(Engine):
     what it leaves open (micro batch, clipping, bucket sizes) is known here.
 
     Args:
-        accelerator, model, build, clip: as in `Engine`.
+        accelerator, model, build, max_grad_norm: as in `Engine`.
         micro_batch: images on this rank.
 
     Raises:
@@ -41,13 +41,13 @@ class ZeroEngine(Engine):
     name = "zero"
 
     def __init__(
-        self, accelerator: Any, model: PlaceModel, build: BuildOptimizer, clip: float | None, micro_batch: int
+        self, accelerator: Any, model: PlaceModel, build: BuildOptimizer, max_grad_norm: float | None, micro_batch: int
     ) -> None:
         plugin = accelerator.state.deepspeed_plugin
-        self._settings = zero_settings(plugin.deepspeed_config, accelerator.mixed_precision, clip, micro_batch)
+        self._settings = zero_settings(plugin.deepspeed_config, accelerator.mixed_precision, max_grad_norm, micro_batch)
         self.stage = int(self._settings["zero_optimization"]["stage"])
         self.name = f"zero{self.stage}"
-        super().__init__(accelerator, model, build, clip)
+        super().__init__(accelerator, model, build, max_grad_norm)
 
     def _wrap(self, model: PlaceModel, build: BuildOptimizer) -> None:
         import logging
@@ -165,13 +165,15 @@ class ZeroEngine(Engine):
             self._template.to("cpu")
 
 
-def zero_settings(given: dict[str, Any], precision: str, clip: float | None, micro_batch: int) -> dict[str, Any]:
+def zero_settings(
+    given: dict[str, Any], precision: str, max_grad_norm: float | None, micro_batch: int
+) -> dict[str, Any]:
     """The DeepSpeed config: what the launcher gave, completed; bf16 as autocast over float32 weights.
 
     Args:
         given: the launcher's DeepSpeed config.
         precision: Accelerate's mixed precision.
-        clip: largest gradient norm, or None.
+        max_grad_norm: largest gradient norm, or None.
         micro_batch: images on a rank.
 
     Raises:
@@ -202,7 +204,7 @@ def zero_settings(given: dict[str, Any], precision: str, clip: float | None, mic
     settings: dict[str, Any] = {
         "train_micro_batch_size_per_gpu": micro_batch,
         "gradient_accumulation_steps": 1,
-        "gradient_clipping": clip or 0.0,
+        "gradient_clipping": max_grad_norm or 0.0,
         "steps_per_print": 1 << 40,
         "zero_allow_untested_optimizer": True,  # plain SGD
         "zero_optimization": {

@@ -52,14 +52,14 @@ def test_variants_say_what_the_papers_names_say() -> None:
 
 @pytest.mark.parametrize("last", [1, 2])
 def test_last_blocks_are_trained_with_their_adapters(small: ModelConfig, small_images: Tensor, last: int) -> None:
-    model = build_model(dataclasses.replace(small, train="last", last_blocks=last), SIZE)
+    model = build_model(dataclasses.replace(small, trainable="last", last_blocks=last), SIZE)
     model(small_images)[:, ::3].sum().backward()
     trained = {n for n, p in model.named_parameters() if p.requires_grad}
     assert trained == {n for n, p in model.named_parameters() if p.grad is not None}
     assert {n.split(".")[4] for n in trained if "encoder.layer" in n} == {str(i) for i in range(2 - last, 2)}
     assert len(model.backbone.adapters()) == last
     with pytest.raises(UsageError, match="last_blocks 3"):
-        build_model(dataclasses.replace(small, train="last", last_blocks=3), SIZE)
+        build_model(dataclasses.replace(small, trainable="last", last_blocks=3), SIZE)
 
 
 def test_released_sizes_have_the_released_parameter_counts() -> None:

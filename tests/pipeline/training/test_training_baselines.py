@@ -46,7 +46,7 @@ def settings(root: Path, kind: str, resnet: bool) -> dict[str, Any]:
         "adapter": {"kind": "none"},
         "pooling": {"kind": kind, **({kind: TINY_POOLING[kind]} if kind in TINY_POOLING else {})},
         "cross_image": {"layers": 0},
-        "train": "last",
+        "trainable": "last",
         "last_blocks": 1,
     }
     values["train"] = {"steps": 1, "lr": 1e-2, "log_every": 1, "optimizer": "sgd"}

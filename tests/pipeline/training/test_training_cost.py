@@ -21,7 +21,7 @@ SMALL = ModelConfig(
     backbone=BackboneConfig(name="custom", dim=32, depth=2, heads=2, patch=14, pretrain_grid=4),
     adapter=AdapterConfig(reduced=4),
     cross_image=CrossImageConfig(layers=2, heads=4, feedforward=48, dropout=0.0),
-    train="full",
+    trainable="full",
 )
 VIT_B = StepSizes(
     images=288, regions=14, dim=768, layers=2, feedforward=2048, tokens=257, depth=12,

@@ -23,7 +23,7 @@ SMALL = ModelConfig(
     backbone=BackboneConfig(name="custom", dim=32, depth=2, heads=2, patch=14, pretrain_grid=4),
     adapter=AdapterConfig(reduced=4),
     cross_image=CrossImageConfig(layers=2, heads=4, feedforward=48, dropout=0.0),
-    train="full",
+    trainable="full",
 )
 PLACES, VIEWS, SIZE, STEPS = 8, 4, 56, 3
 
@@ -80,7 +80,7 @@ def worst(truth: dict[str, Tensor], found: dict[str, Tensor]) -> float:
 
 VARIANTS = {
     "published": SMALL,
-    "adapters_only": replace(SMALL, train="adapters"),
+    "adapters_only": replace(SMALL, trainable="adapters"),
     "group_norm": replace(SMALL, adapter=replace(SMALL.adapter, norm="group")),
     "no_encoder": replace(SMALL, cross_image=replace(SMALL.cross_image, layers=0)),
 }

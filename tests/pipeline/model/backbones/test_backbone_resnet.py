@@ -28,7 +28,7 @@ TINY = ModelConfig(
     adapter=AdapterConfig(kind="none"),
     pooling=PoolingConfig(kind="gem", normalise=False),
     cross_image=CrossImageConfig(layers=0),
-    train="last",
+    trainable="last",
     last_blocks=2,
 )
 
@@ -131,7 +131,7 @@ def test_statistics_are_of_the_global_batch_and_chunks_change_nothing() -> None:
 
 def test_adapters_and_surplus_stages_are_refused() -> None:
     for config, complaint in (
-        (dataclasses.replace(TINY, train="adapters"), "adapters belong to transformer blocks"),
+        (dataclasses.replace(TINY, trainable="adapters"), "adapters belong to transformer blocks"),
         (dataclasses.replace(TINY, last_blocks=4), "last_blocks 4"),
         (changed(cut="layer4"), "fewer stages than layer4"),
     ):
@@ -164,7 +164,7 @@ def gardens_point(shared: Path, layout: str, traverse: str, every: int, size: tu
     """GeM over layer 4 of a traverse's frames, [n, 2048] of unit length; the real ImageNet weights."""
     settings = ResNetConfig(layout=layout)  # type: ignore[arg-type]
     backbone = BackboneConfig(name="resnet50", weights=str(shared / WEIGHTS), resnet=settings)
-    network = ResNet(ModelConfig(backbone=backbone, adapter=AdapterConfig(kind="none"), train="frozen"), 224).eval()
+    network = ResNet(ModelConfig(backbone=backbone, adapter=AdapterConfig(kind="none"), trainable="frozen"), 224).eval()
     found = []
     for path in sorted((shared / "data" / "gardens_point" / traverse).iterdir())[::every]:
         picture = Image.open(path).convert("RGB").resize(size, Image.Resampling.BILINEAR)

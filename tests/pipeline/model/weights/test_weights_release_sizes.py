@@ -45,7 +45,7 @@ def published(name: str, cut: str = "layer4") -> ModelConfig:
     return ModelConfig(
         backbone=BackboneConfig(name=name, resnet=ResNetConfig(cut=cut)),  # type: ignore[arg-type]
         adapter=AdapterConfig(kind="none"), pooling=PoolingConfig(kind="gem"),
-        cross_image=CrossImageConfig(layers=0), train="frozen",
+        cross_image=CrossImageConfig(layers=0), trainable="frozen",
     )  # fmt: skip
 
 

@@ -42,7 +42,7 @@ def test_backbones_with_registers_are_the_library_models(rope: bool, small: Mode
     theirs = library(rope)
     theirs.save_pretrained(tmp_path)
     config = with_backbone(small, registers=4, rope=rope, weights=str(tmp_path))
-    ours = Backbone(dataclasses.replace(config, adapter=AdapterConfig(kind="none"), train="frozen"), SIZE).eval()
+    ours = Backbone(dataclasses.replace(config, adapter=AdapterConfig(kind="none"), trainable="frozen"), SIZE).eval()
     images = torch.randn(2, 3, SIZE, SIZE)
     with torch.no_grad():
         wanted = theirs(images).last_hidden_state
@@ -53,15 +53,15 @@ def test_backbones_with_registers_are_the_library_models(rope: bool, small: Mode
     assert torch.allclose(trained, tokens, atol=2e-5)  # no jitter of positions in train mode
 
 
-@pytest.mark.parametrize("train", ["adapters", "full", "last"])
+@pytest.mark.parametrize("trainable", ["adapters", "full", "last"])
 @pytest.mark.parametrize("rope", [True, False])
-def test_adapters_and_training_work_with_registers(rope: bool, train: str, small: ModelConfig) -> None:
-    config = dataclasses.replace(with_backbone(small, registers=4, rope=rope), train=train, last_blocks=1)
+def test_adapters_and_training_work_with_registers(rope: bool, trainable: str, small: ModelConfig) -> None:
+    config = dataclasses.replace(with_backbone(small, registers=4, rope=rope), trainable=trainable, last_blocks=1)
     model = build_model(config, SIZE)
     (model(torch.randn(4, 3, SIZE, SIZE)) * torch.randn(4, model.descriptor_dim)).sum().backward()
     trained = {n for n, p in model.named_parameters() if p.requires_grad}
     assert {n for n, p in model.named_parameters() if p.grad is not None} == trained
-    assert len(model.backbone.adapters()) == (1 if train == "last" else 2)  # type: ignore[union-attr]
+    assert len(model.backbone.adapters()) == (1 if trainable == "last" else 2)  # type: ignore[union-attr]
 
 
 def test_dinov3_release_layout_loads(small: ModelConfig, tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_dinov3_release_layout_loads(small: ModelConfig, tmp_path: Path) -> None
             release[f"{block}.ls{n}.gamma"] = state[f"{layer}.layer_scale{n}.lambda1"]
     torch.save(release, tmp_path / "dinov3.pth")
     config = with_backbone(small, registers=4, rope=True, weights=str(tmp_path / "dinov3.pth"))
-    ours = Backbone(dataclasses.replace(config, adapter=AdapterConfig(kind="none"), train="frozen"), SIZE).eval()
+    ours = Backbone(dataclasses.replace(config, adapter=AdapterConfig(kind="none"), trainable="frozen"), SIZE).eval()
     images = torch.randn(2, 3, SIZE, SIZE)
     with torch.no_grad():
         assert torch.allclose(ours(images)[:, 1:], theirs(images).last_hidden_state[:, 5:], atol=2e-5)

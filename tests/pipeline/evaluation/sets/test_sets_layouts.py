@@ -219,7 +219,7 @@ def test_sets_are_read_without_torch(tmp_path: Path) -> None:
     import sys
 
     code = "import sys, pipeline.evaluation.sets.load as d; d.available('.'); sys.exit('torch' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[3])
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[4])
 
 
 def test_dots_in_folder_names_stay(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_transformers_folders_load(shards: int, tmp_path: Path, small: ModelConf
     ).eval()
     library.save_pretrained(tmp_path, max_shard_size="10GB" if shards == 1 else "60KB")
     assert (len(list(tmp_path.glob("*.safetensors"))) > 1) == (shards > 1)
-    config = with_weights(dataclasses.replace(small, train="frozen"), tmp_path)
+    config = with_weights(dataclasses.replace(small, trainable="frozen"), tmp_path)
     config = dataclasses.replace(config, backbone=dataclasses.replace(config.backbone, pretrain_grid=6))
     images = torch.randn(2, 3, SIZE, SIZE)
     with torch.no_grad():

@@ -23,7 +23,7 @@ CONFIG = ModelConfig(
     adapter=AdapterConfig(kind="none"),
     pooling=PoolingConfig(kind="netvlad", netvlad=NetVLADConfig(clusters=3, projection=5)),
     cross_image=CrossImageConfig(layers=0),
-    train="last",
+    trainable="last",
     last_blocks=1,
 )
 
@@ -65,7 +65,7 @@ def test_gradients_reach_the_last_stage_and_the_aggregator() -> None:
 def test_settings_that_do_not_fit_are_one_line(tmp_path: Path) -> None:
     torch.save({"conv1.weight": torch.ones(1)}, tmp_path / "resnet.pth")
     for config, size, message in (
-        (dataclasses.replace(CONFIG, train="adapters"), 32, "adapters belong to transformer blocks"),
+        (dataclasses.replace(CONFIG, trainable="adapters"), 32, "adapters belong to transformer blocks"),
         (dataclasses.replace(CONFIG, last_blocks=6), 32, "between 1 and the 5 stages"),
         (CONFIG, 15, "image_size 15 is smaller"),
         (backbone(weights=str(tmp_path / "resnet.pth")), 32, r"resnet\.pth \(for backbone\.name vgg16\).*lacks 26"),

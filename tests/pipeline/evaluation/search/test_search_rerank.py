@@ -147,7 +147,7 @@ def tiny_model(kind: str) -> PlaceModel:
     if kind == "resnet":
         resnet = BackboneConfig(name="resnet_custom", resnet=ResNetConfig(stages=(1, 1), width=4, cut="layer2"))
         no_adapter = AdapterConfig(kind="none")
-        return build_model(ModelConfig(resnet, adapter=no_adapter, cross_image=none, train="full"), 64).eval()
+        return build_model(ModelConfig(resnet, adapter=no_adapter, cross_image=none, trainable="full"), 64).eval()
     custom = BackboneConfig(name="custom", dim=16, depth=2, heads=2, patch=7, pretrain_grid=4)
     return build_model(ModelConfig(custom, AdapterConfig(reduced=4), cross_image=none), 28).eval()
 
