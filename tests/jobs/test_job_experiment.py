@@ -23,7 +23,7 @@ from pipeline.config import CrossImageConfig, EvaluationConfig, ModelConfig, Run
 from pipeline.config.model import BackboneConfig
 from pipeline.evaluation.report import paper_numbers
 from pipeline.model.variants import VARIANTS, variant
-from pipeline.paper import plan, study, table_report
+from pipeline.paper import plan, study, table_report, values
 from pipeline.paper.rows import TABLES, Row, table
 from pipeline.paper.runner import Runner
 
