@@ -38,7 +38,19 @@ ALLOWED = {
 }  # fmt: skip
 SOURCES = sorted(p for top in ("shards", "pipeline", "jobs") for p in (ROOT / top).rglob("*.py"))
 # packages that only evaluation, tracking or figures need: importing the trainer must not load them
-LATE = ("faiss", "mlflow", "matplotlib", "transformers", "deepspeed", "sklearn", "pandas", "scipy")
+LATE = (
+    "faiss",
+    "mlflow",
+    "matplotlib",
+    "transformers",
+    "deepspeed",
+    "sklearn",
+    "pandas",
+    "scipy",
+    "pyproj",
+    "rich",
+    "jinja2",
+)
 
 
 def module_name(path: Path) -> str:
