@@ -3,7 +3,7 @@
     python -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k,msls_val --root data
     accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k
 
-Prints one table and writes results.json, results.md, results.csv, predictions/, figures/ and html.html. The number of
+Prints one table and writes results.json, results.md, results.csv, predictions/, figures/ and report.html. The number of
 processes changes nothing but the time. Sets that are missing are named and left out; exit code 3 when none is there.
 """
 
@@ -81,13 +81,13 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
         pictures = html.draw(results, sets, output / "figures", model)
         facts = {key: str(value) for key, value in about.items()}
         title = f"Evaluation of {(runs[0] if runs else file).name}"
-        html.write_report(results, pictures, output / "html.html", title, facts)
+        html.write_report(results, pictures, output / "report.html", title, facts)
     if job.track and runs:
         from pipeline.training.tracking import record_evaluation
 
         values = {name: value for entry in tables.as_dicts(results) for name, value in entry["metrics"].items()}
         record_evaluation(runs[0], read_metadata(file)["extra"], values, output)
-    print(f"\nwritten to {output}/" + (": open html.html in a browser" if job.figures else ""))
+    print(f"\nwritten to {output}/" + (": open report.html in a browser" if job.figures else ""))
 
 
 if __name__ == "__main__":

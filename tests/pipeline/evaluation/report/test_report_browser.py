@@ -85,7 +85,7 @@ def test_the_report_is_seen_whole_and_asks_nobody(tmp_path: Path) -> None:
     rows, far = np.array([[0, 1], [1, 2], [3, 2], [4, 5]]), np.ones((4, 2), np.float32)
     result = score(street, protocols(config, 224, "pairs")[0], config, rows, far)
     pictures = html.draw([result], [street], tmp_path / "figures")
-    page = tmp_path / "html.html"
+    page = tmp_path / "report.html"
     html.write_report([result], pictures, page, "Street", {"checkpoint": "none"})
     seen, heard = visit(page, tmp_path)
     assert heard == []

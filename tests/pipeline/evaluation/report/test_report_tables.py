@@ -164,8 +164,8 @@ def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
         "unknown.single.answers.jpg",
         "unknown.attention.jpg",
     }
-    html.write_report(results, pictures, tmp_path / "html.html", "A <test>", {"checkpoint": "a&b"})
-    page = (tmp_path / "html.html").read_text()
+    html.write_report(results, pictures, tmp_path / "report.html", "A <test>", {"checkpoint": "a&b"})
+    page = (tmp_path / "report.html").read_text()
     assert page.count("<img") == len(pictures) == page.count("base64,")
     assert not re.search(r'(?:src|href)="(?!data:|#)', page) and "<script" not in page and "url(" not in page
     assert "A &lt;test&gt;" in page and "a&amp;b" in page and "each image alone" in page
