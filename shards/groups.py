@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,7 +150,9 @@ def read_part(out: Path, group: int) -> tuple[pa.Table, dict[str, Any]]:
 def _is_finished(task: GroupTask) -> bool:
     """Whether an earlier run finished this group and its shards are still what it wrote."""
     try:
-        facts = read_part(task.out, task.number)[1]
+        table, facts = read_part(task.out, task.number)
+        if not table.schema.equals(PART_SCHEMA):  # of an earlier version of this program
+            return False
         for shard in facts["shards"]:
             with (task.out / shard["name"]).open("rb") as stream:
                 if hashlib.file_digest(stream, "sha256").hexdigest() != shard["sha256"]:
@@ -179,6 +182,7 @@ def _write_samples(task: GroupTask, shards: list[ShardFile]) -> tuple[list[dict[
         if len(good) < IMAGES_A_PLACE:
             facts["fallen"].append((city, place_id, len(good), count))
             continue
+        lat, lon = _mean_position([photo for photo, _ in good])
         shown = [good[i] for i in permutation(task.seed, city, place_id, [photo["path"] for photo, _ in good])]
         for round_, shard in enumerate(shards):
             number = round_ * task.stride + position
@@ -188,10 +192,23 @@ def _write_samples(task: GroupTask, shards: list[ShardFile]) -> tuple[list[dict[
             rows.append(
                 {
                     "number": number, "good": len(good), "sample": key, "round": round_, "city": city,
-                    "place_id": place_id, "shard": shard_name(round_, task.number), **_where(members),
+                    "place_id": place_id, "shard": shard_name(round_, task.number), "lat": lat, "lon": lon,
+                    **_where(members),
                 }
             )  # fmt: skip
     return rows, facts
+
+
+def _mean_position(photos: list[dict[str, Any]]) -> tuple[float | None, float | None]:
+    """Mean latitude and longitude in degrees of the photos that have both; None where none has."""
+    known = [(p["lat"], p["lon"]) for p in photos if p["lat"] is not None and p["lon"] is not None]
+    if not known:
+        return None, None
+    lats, lons = [lat for lat, _ in known], [lon for _, lon in known]
+    if max(lons) - min(lons) > 180:  # the place lies on both sides of the 180th meridian
+        lons = [lon + 360 * (lon < 0) for lon in lons]
+    lon = math.fsum(lons) / len(known)
+    return math.fsum(lats) / len(known), lon - 360 * (lon > 180)
 
 
 def _read(path: Path, rule: ImageRule, facts: dict[str, Any]) -> bytes | Refused:

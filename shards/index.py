@@ -16,13 +16,15 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.common.errors import DataError
 from pipeline.common.progress import track
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+_WITHOUT_POSITIONS = 1  # the format before it, without `lat` and `lon`: still read
 IMAGES_A_SAMPLE = 4
 INDEX, MANIFEST, REPORT, UNFINISHED = "index.parquet", "manifest.json", "report.csv", "unfinished"
 SCHEMA = pa.schema(
@@ -37,6 +39,8 @@ SCHEMA = pa.schema(
         ("sizes", pa.list_(pa.int64(), IMAGES_A_SAMPLE)),  # its length in bytes
         ("json_offset", pa.int64()),
         ("json_size", pa.int64()),
+        ("lat", pa.float64()),  # degrees: mean of the place's images, the same in all rounds; null where unknown
+        ("lon", pa.float64()),
     ]
 )
 _BLOCK = 1 << 22
@@ -64,6 +68,21 @@ class ShardIndex:
     def rounds(self) -> int:
         """Number of rounds R; epoch e reads round e mod R."""
         return int(self.manifest["counts"]["rounds"])
+
+    def positions(self) -> np.ndarray:
+        """Latitude and longitude of each place in degrees, float64 [P, 2]; NaN where the source gave none.
+
+        Raises:
+            DataError: the set was made before the index had positions.
+        """
+        if self.manifest["format_version"] == _WITHOUT_POSITIONS:
+            raise DataError(
+                f"{self.root}/{INDEX} was written without positions (lat, lon) by an earlier version: "
+                f"prepare the shards again with --overwrite"
+            )
+        found = np.full((self.places, 2), np.nan)
+        found[self.table["place"].to_numpy()] = np.stack([self.table[n].to_numpy() for n in ("lat", "lon")], axis=1)
+        return found
 
 
 def read_index(root: str) -> ShardIndex:
@@ -198,7 +217,7 @@ def _read_manifest(raw: bytes) -> tuple[dict[str, Any], list[str]]:
     version = manifest.get("format_version") if isinstance(manifest, dict) else None
     if not isinstance(manifest, dict) or raw != sealed_manifest(manifest):
         return {}, [f"{MANIFEST} has changed: it does not agree with the sha256 inside it"]
-    if version != FORMAT_VERSION:
+    if version not in (_WITHOUT_POSITIONS, FORMAT_VERSION):
         return {}, [f"{MANIFEST} has format version {version}, this program reads {FORMAT_VERSION}: prepare again"]
     return manifest, []
 
@@ -210,6 +229,9 @@ def _read_table(raw: bytes, manifest: dict[str, Any]) -> tuple[pa.Table | None, 
         table = pq.read_table(io.BytesIO(raw))
     except (pa.ArrowInvalid, OSError) as error:
         return None, [f"{INDEX} cannot be read: {error}"]
+    if manifest["format_version"] == _WITHOUT_POSITIONS:
+        for name in ("lat", "lon"):
+            table = table.append_column(name, pa.nulls(table.num_rows, pa.float64()))
     if table.schema.names != SCHEMA.names:
         return None, [f"{INDEX} has columns {table.schema.names}, expected {SCHEMA.names}"]
     if table.num_rows != manifest["counts"]["samples"]:

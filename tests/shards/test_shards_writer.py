@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import multiprocessing
 from collections import Counter
@@ -10,11 +11,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import webdataset
 
 from pipeline.common.errors import DataError, UsageError
-from shards import index
+from shards import groups, index
 from shards.images import ImageRule
 from shards.report import Summary
 from shards.sources.registry import read_source
@@ -108,6 +111,51 @@ def test_the_order_of_the_index(written: tuple[Path, Path, Summary]) -> None:
     by_name = sorted({(row["city"], row["place_id"], row["place"]) for row in table})
     assert [place for _, _, place in by_name] == list(range(7))
     assert [row["sample"] for row in table] == sorted(row["sample"] for row in table)
+
+
+def test_the_index_has_the_mean_position_of_each_place(written: tuple[Path, Path, Summary]) -> None:
+    """Of all its images, not of the four of a round; the same in all rounds."""
+    source, out, _ = written
+    told: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for frame in (source / "Dataframes").iterdir():
+        with frame.open() as stream:
+            for row in csv.DictReader(stream):
+                told.setdefault((row["city_id"], row["place_id"]), []).append((float(row["lat"]), float(row["lon"])))
+    opened = index.read_index(str(out))
+    positions = opened.positions()
+    assert positions.shape == (7, 2)
+    for row in opened.table.to_pylist():
+        mean = np.mean(told[row["city"], row["place_id"]], axis=0)
+        assert np.abs(mean - (row["lat"], row["lon"])).max() < 1e-12
+        assert positions[row["place"]].tolist() == [row["lat"], row["lon"]]
+
+
+@pytest.mark.parametrize(
+    ("photos", "mean"),
+    [
+        ([(10.0, 20.0), (12.0, 22.0), (None, None), (5.0, None)], (11.0, 21.0)),
+        ([(0.0, 179.5), (0.0, -179.0)], (0.0, -179.75)),  # across the 180th meridian
+        ([(None, None)] * 4, (None, None)),
+    ],
+)
+def test_the_mean_position(photos: list[tuple[float | None, float | None]], mean: tuple[object, object]) -> None:
+    assert groups._mean_position([{"lat": lat, "lon": lon} for lat, lon in photos]) == mean
+
+
+def test_a_set_made_before_the_index_had_positions_is_read(written: tuple[Path, Path, Summary]) -> None:
+    """Training needs none; what does need them says how to get them."""
+    out = written[1]
+    now = index.read_index(str(out))
+    sink = io.BytesIO()
+    pq.write_table(now.table.drop_columns(["lat", "lon"]), sink)
+    manifest = {**now.manifest, "format_version": 1, "index_sha256": index.sha256(sink.getvalue())}
+    (out / index.INDEX).write_bytes(sink.getvalue())
+    (out / index.MANIFEST).write_bytes(index.sealed_manifest(manifest))
+    old = index.read_index(str(out))
+    assert old.table.schema.equals(index.SCHEMA) and index.verify(str(out)) == []
+    assert old.table.drop_columns(["lat", "lon"]).equals(now.table.drop_columns(["lat", "lon"]))
+    with pytest.raises(DataError, match=r"without positions .* --overwrite"):
+        old.positions()
 
 
 def test_nothing_disappears_from_the_counts(written: tuple[Path, Path, Summary]) -> None:
@@ -271,8 +319,6 @@ def test_finished_groups_are_kept_only_while_their_shards_are_whole(
     written: tuple[Path, Path, Summary], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A run that stops after its third group continues; a shard that rotted meanwhile is written again."""
-    from shards import groups
-
     source, whole, _ = written
     out, rule = tmp_path / "other", WriteRule(rounds=3, workers=1, shard_mb=SMALL)
     write, calls = groups.write_group, []

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pytest
 from PIL import Image
 
-from shards.index import SCHEMA, ShardIndex
+from shards.index import FORMAT_VERSION, SCHEMA, ShardIndex
 
 Build = Callable[..., ShardIndex]
 
@@ -29,11 +29,12 @@ def table_of(cities: list[int], rounds: int = 1, samples_a_shard: int = 16) -> S
                 sample = len(rows["sample"])
                 shard = f"round{r}-{place // samples_a_shard:04d}.tar"
                 sizes[shard] = sizes.get(shard, 0) + 1000
-                values = (f"{sample:06d}", r, f"City{city}", str(number), place, shard, [0] * 4, [10] * 4, 0, 2)
+                values = (f"{sample:06d}", r, f"City{city}", str(number), place, shard, [0] * 4, [10] * 4, 0, 2, 40.0 + city, number / 1e3)
                 for name, value in zip(SCHEMA.names, values, strict=True):
                     rows[name].append(value)
                 place += 1
     manifest = {
+        "format_version": FORMAT_VERSION,
         "shards": [
             {"name": name, "bytes": size, "sha256": "", "samples": size // 1000} for name, size in sizes.items()
         ],
