@@ -29,7 +29,20 @@ def table_of(cities: list[int], rounds: int = 1, samples_a_shard: int = 16) -> S
                 sample = len(rows["sample"])
                 shard = f"round{r}-{place // samples_a_shard:04d}.tar"
                 sizes[shard] = sizes.get(shard, 0) + 1000
-                values = (f"{sample:06d}", r, f"City{city}", str(number), place, shard, [0] * 4, [10] * 4, 0, 2, 40.0 + city, number / 1e3)
+                values = (
+                    f"{sample:06d}",
+                    r,
+                    f"City{city}",
+                    str(number),
+                    place,
+                    shard,
+                    [0] * 4,
+                    [10] * 4,
+                    0,
+                    2,
+                    40.0 + city,
+                    number / 1e3,
+                )
                 for name, value in zip(SCHEMA.names, values, strict=True):
                     rows[name].append(value)
                 place += 1
