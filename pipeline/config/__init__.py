@@ -62,6 +62,8 @@ class LossConfig:
     """The similarity threshold lambda (paper: 0)."""
     margin: float = 0.1
     """Mining margin (paper: 0.1)."""
+    ignore_within: float = 0.0
+    """Pairs of different places closer than this many metres are neither positive nor negative; 0: none (published)."""
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,26 @@ class MultiSimilarityLoss(nn.Module):
         beta: weight of negatives.
         base: similarity threshold lambda.
         margin: mining margin.
+        ignore_within: metres; a pair of two places closer than this is neither positive nor negative. 0: none is.
+        points: [P, 3] float64, where place number p lies, in metres (pipeline.data.positions); NaN where unknown, and
+            then near to nothing. The same on all ranks.
     """
 
-    def __init__(self, alpha: float = 1.0, beta: float = 50.0, base: float = 0.0, margin: float = 0.1) -> None:
+    points: Tensor | None
+
+    def __init__(
+        self,
+        alpha: float = 1.0,
+        beta: float = 50.0,
+        base: float = 0.0,
+        margin: float = 0.1,
+        ignore_within: float = 0.0,
+        points: Tensor | None = None,
+    ) -> None:
         super().__init__()
         self.alpha, self.beta, self.base, self.margin = alpha, beta, base, margin
+        self.ignore_within = ignore_within
+        self.register_buffer("points", points, persistent=False)
         self._summary: tuple[int, Tensor] | None = None
 
     def forward(self, descriptors: Tensor, labels: Tensor) -> Tensor:
@@ -78,7 +93,8 @@ class MultiSimilarityLoss(nn.Module):
         same = labels[:, None] == everyone[None, :]
         columns = torch.arange(len(everyone), device=labels.device)
         itself = columns == rank() * b + columns[:b, None]
-        positive, negative = self.mine(similarity.detach(), same & ~itself, ~same)
+        different = ~same & ~self._near(labels, everyone)
+        positive, negative = self.mine(similarity.detach(), same & ~itself, different)
 
         push = self._soft_sum(-self.alpha * (similarity - self.base), positive) / self.alpha
         pull = self._soft_sum(self.beta * (similarity - self.base), negative) / self.beta
@@ -91,6 +107,18 @@ class MultiSimilarityLoss(nn.Module):
             dist.all_reduce(summary)
         self._summary = (len(everyone), summary[1:])
         return local + (summary[0] / world_size() - local.detach())
+
+    def _near(self, labels: Tensor, everyone: Tensor) -> Tensor:
+        """Which pairs lie closer than `ignore_within`: labels [b] and [B] -> bool [b, B], or one False for all.
+
+        From the gathered labels and the whole table of points, so no rank can see another distance than the others.
+        """
+        if self.points is None or not self.ignore_within:
+            return torch.zeros((), dtype=torch.bool, device=labels.device)
+        own, others = self.points[labels], self.points[everyone]
+        squared = sum((own[:, None, axis] - others[None, :, axis]).square() for axis in range(3))
+        near: Tensor = squared < self.ignore_within**2
+        return near
 
     def mine(self, similarity: Tensor, positive: Tensor, negative: Tensor) -> tuple[Tensor, Tensor]:
         """Hard pairs of each anchor: boolean masks [b, B] from similarities [b, B] and the masks of all pairs."""

@@ -23,6 +23,7 @@ from pipeline.config import RunConfig, to_dict
 from pipeline.data.images import normalise
 from pipeline.data.places import Batch, build_loader
 from pipeline.data.plan import plan
+from pipeline.data.positions import place_points
 from pipeline.distributed import any_rank, barrier, broadcast_object, rank, world_size
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.files import frozen_hash, load_trainable, save_model, saved_names
@@ -38,7 +39,7 @@ from pipeline.training.meter import Meter
 from pipeline.training.schedule import build_optimizer, learning_rate
 from pipeline.training.tracking import Tracker
 from pipeline.training.validation import Validation
-from shards.index import read_index
+from shards.index import ShardIndex, read_index
 
 
 @dataclass(frozen=True)
@@ -94,9 +95,7 @@ class Trainer:
             4 * config.data.places_per_batch // world_size(),
         )
         self.engine.load(optimizer, self.state.scaler)
-        self.loss = MultiSimilarityLoss(
-            alpha=config.loss.alpha, beta=config.loss.beta, base=config.loss.base, margin=config.loss.margin
-        )
+        self.loss = build_loss(config, self.index).to(accelerator.device)
         self.validation = Validation(config, accelerator.device) if config.validate.sets else None
 
     def fit(self) -> Outcome:
@@ -322,6 +321,24 @@ class Trainer:
 def step_seed(seed: int, step: int, r: int) -> int:
     """Seed of a step's dropout on a rank; distinct over (seed, step, rank) below 2^20 steps and 2^12 ranks a seed."""
     return ((seed << 32) + (step << 12) + r) % (1 << 63)
+
+
+def build_loss(config: RunConfig, index: ShardIndex) -> MultiSimilarityLoss:
+    """The loss of a run, with the places' positions where it needs them; says once how many are unknown.
+
+    Raises:
+        DataError: `loss.ignore_within` on shards without positions.
+    """
+    loss, points = config.loss, None
+    if loss.ignore_within:
+        found, unknown = place_points(index, f"loss.ignore_within={loss.ignore_within:g}")
+        points = torch.from_numpy(found)
+        if unknown and rank() == 0:
+            print(
+                f"loss.ignore_within: {unknown:,} of {len(found):,} places have no position; no pair of theirs is "
+                "ignored", file=sys.stderr, flush=True,
+            )  # fmt: skip
+    return MultiSimilarityLoss(loss.alpha, loss.beta, loss.base, loss.margin, loss.ignore_within, points)
 
 
 def check_batch(config: RunConfig, steps_per_epoch: int) -> None:

@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from processes import run_ranks
 from torch.nn import functional as F
 
+from pipeline.data.positions import points
+from pipeline.distributed import rank_slice, world_size
 from pipeline.training.loss import MultiSimilarityLoss
 
 
@@ -88,3 +91,54 @@ def test_bfloat16_descriptors_are_compared_in_float32() -> None:
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="need \\[b, dim\\]"):
         MultiSimilarityLoss()(torch.randn(4, 8), torch.zeros(5, dtype=torch.long))
+
+
+def near_loss(labels: torch.Tensor, x: torch.Tensor, points: torch.Tensor, within: float) -> tuple[float, torch.Tensor]:
+    """This rank's part of a global batch: the loss and the whole gradient of the mean, summed over ranks."""
+    mine = rank_slice(len(labels))
+    own = x[mine].clone().requires_grad_()
+    loss = MultiSimilarityLoss(ignore_within=within, points=points)(own, labels[mine])
+    loss.backward()
+    assert own.grad is not None
+    return loss.item(), own.grad / world_size()
+
+
+def test_pairs_of_near_places_are_ignored_whatever_the_number_of_ranks() -> None:
+    """Against the definition, written out pair by pair with the great-circle formula; float64."""
+    generator = torch.Generator().manual_seed(3)
+    labels = torch.tensor([7, 2, 5, 3, 8, 4]).repeat_interleave(4)
+    # places 20 m apart in a row across the 180th meridian, at 60 degrees north; place 5 is unknown
+    step = 20 / (111_194.93 * 0.5)
+    degrees = np.array([[60.0, (180 + step * (i - 4.5) + 180) % 360 - 180] for i in range(10)])
+    degrees[5] = np.nan
+    table = torch.from_numpy(points(degrees))
+    x = (torch.randn(6, 1, 12, generator=generator) + torch.randn(6, 4, 12, generator=generator)).reshape(24, 12)
+    x = x.double()
+
+    def metres(a: int, b: int) -> float:
+        (lat, lon), (lat2, lon2) = np.radians(degrees[a]), np.radians(degrees[b])
+        h = np.sin((lat2 - lat) / 2) ** 2 + np.cos(lat) * np.cos(lat2) * np.sin((lon2 - lon) / 2) ** 2
+        return float(2 * 6_371_008.8 * np.arcsin(np.sqrt(h)))
+
+    def defined(within: float) -> torch.Tensor:
+        unit = F.normalize(x, dim=1)
+        total = torch.zeros((), dtype=torch.float64)
+        for q, anchor in enumerate(labels.tolist()):
+            s = unit @ unit[q]
+            same = [i for i, label in enumerate(labels.tolist()) if label == anchor and i != q]
+            other = [
+                i for i, label in enumerate(labels.tolist()) if label != anchor and not metres(anchor, label) < within
+            ]
+            hard, easy = max(s[i] for i in other), min(s[i] for i in same)
+            push = [torch.exp(-s[i]) for i in same if s[i] - 0.1 < hard]
+            pull = [torch.exp(50 * s[i]) for i in other if s[i] + 0.1 > easy]
+            total = total + torch.log1p(sum(push, torch.zeros(()))) + torch.log1p(sum(pull, torch.zeros(()))) / 50
+        return total / len(labels)
+
+    losses = {within: near_loss(labels, x, table, within) for within in (0.0, 30.0, 45.0)}
+    assert len({round(value, 9) for value, _ in losses.values()}) == 3  # each distance really changes the pairs
+    for within, (value, gradient) in losses.items():
+        assert value == pytest.approx(float(defined(within)), rel=1e-12)
+        ranks = run_ranks(near_loss, 2, labels, x, table, within)
+        assert [r[0] for r in ranks] == pytest.approx([value] * 2, rel=1e-12)
+        torch.testing.assert_close(torch.cat([r[1] for r in ranks]), gradient, rtol=1e-10, atol=1e-14)
