@@ -10,6 +10,7 @@ import torch
 
 from pipeline.config import RunConfig
 from pipeline.data.plan import plan
+from pipeline.data.positions import place_points
 from pipeline.distributed import world_size
 from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
 from shards.index import ShardIndex, read_index
@@ -56,6 +57,8 @@ def preview(config: RunConfig) -> list[tuple[str, str]]:
 
 def _plan_rows(config: RunConfig, index: ShardIndex) -> list[tuple[str, str]]:
     data, w = config.data, world_size()
+    if config.loss.ignore_within:
+        place_points(index, f"loss.ignore_within={config.loss.ignore_within:g}")
     first = plan(index, config.seed, 0, data.places_per_batch, data.order, data.window_shards)
     steps = len(first.batches)
     images = 4 * data.places_per_batch

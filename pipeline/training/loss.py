@@ -116,9 +116,8 @@ class MultiSimilarityLoss(nn.Module):
         if self.points is None or not self.ignore_within:
             return torch.zeros((), dtype=torch.bool, device=labels.device)
         own, others = self.points[labels], self.points[everyone]
-        squared = sum((own[:, None, axis] - others[None, :, axis]).square() for axis in range(3))
-        near: Tensor = squared < self.ignore_within**2
-        return near
+        x, y, z = ((own[:, None, axis] - others[None, :, axis]).square() for axis in range(3))
+        return x + y + z < self.ignore_within**2
 
     def mine(self, similarity: Tensor, positive: Tensor, negative: Tensor) -> tuple[Tensor, Tensor]:
         """Hard pairs of each anchor: boolean masks [b, B] from similarities [b, B] and the masks of all pairs."""
