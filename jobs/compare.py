@@ -49,12 +49,12 @@ def main() -> None:
     from pipeline.training.tracking import store_uri
 
     runs = comparison.load_runs(store_uri(job.uri, job.output), job.experiment, job.runs)
-    table = comparison.cells(runs)
-    print(comparison.as_text(table))
+    table = comparison.table(runs)
+    table.print()
     folder = Path(job.output) / "comparison"
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "comparison.md").write_text(comparison.as_markdown(table))
-    comparison.write_csv(table, folder / "comparison.csv")
+    (folder / "comparison.md").write_text(table.markdown())
+    (folder / "comparison.csv").write_text(table.csv())
     written = [folder / "comparison.md", folder / "comparison.csv"]
     names = list(dict.fromkeys(run.name for run in runs))
     folders = [(name, Path(job.output) / name / "evaluation/predictions") for name in names]

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from jobs.cli import parse, run_job
+from pipeline.common.text import Table
 from pipeline.config import RunConfig
 
 
@@ -36,19 +37,13 @@ def main() -> None:
     with torch.device("meta"):
         model = build_model(job.model, job.data.image_size)
     sizes = step_sizes(model, 4 * job.places_per_rank, 2 if job.bf16 else 4)
-    rows = table(sizes, job.worlds)
-    print(_markdown(rows))
+    table(sizes, job.worlds).print()
     print("\nMB received for parameters and gradients, float32:\n")
     head = ["W", "ddp, zero1, zero2", "fsdp2, zero3"]
     engines = [
         [str(w), *(f"{engine_wire(engine, sizes, w) / 1e6:,.0f}" for engine in ("ddp", "fsdp2"))] for w in job.worlds
     ]
-    print(_markdown([head, *engines]))
-
-
-def _markdown(rows: list[list[str]]) -> str:
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
-    return "\n".join([lines[0], "|" + "---:|" * len(rows[0]), *lines[1:]])
+    Table(head, engines, left=()).print()
 
 
 if __name__ == "__main__":

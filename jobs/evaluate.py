@@ -73,7 +73,7 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     results = evaluate(model, sets, config, device, output, True, projections, fingerprint)
     if not first:
         return
-    print(tables.terminal(results))
+    tables.show(results)
     about = {"checkpoint": str(file), "fingerprint": fingerprint, "descriptor_dim": model.descriptor_dim}
     plain = {**about, "model": to_dict(model.config), "evaluation": to_dict(config), "left_out": left_out}
     save_results(results, sets, output, plain)

@@ -77,7 +77,7 @@ def main() -> None:
     filled.fill()
     folder = Path(job.output) / "tables" / job.table
     table_report.write(filled, folder)
-    print(table_report.terminal(filled))
+    table_report.show(filled)
     print(f"\nwritten to {folder}/: table.md, table.csv, table.png")
 
 

@@ -80,11 +80,12 @@ def parameters(job: FiguresJob) -> None:
     from pipeline.model.variants import VARIANTS
     from pipeline.paper import parameter_table
 
-    rows = parameter_table.table(job.variants or VARIANTS)
-    print(parameter_table.as_text(rows))
+    table = parameter_table.printed(parameter_table.table(job.variants or VARIANTS))
+    print("Parameters in millions")
+    table.print()
     if job.to:
         Path(job.to).parent.mkdir(parents=True, exist_ok=True)
-        Path(job.to).write_text(parameter_table.as_markdown(rows))
+        Path(job.to).write_text(table.markdown())
         print(f"\nwritten to {job.to}")
 
 

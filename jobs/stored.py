@@ -70,7 +70,7 @@ def main() -> None:
     for line in left_out:
         print(f"left out: {line}", file=sys.stderr)
     results = evaluate_stores(folder, sets, config, (None, *job.dimensions))
-    print(tables.terminal(results))
+    tables.show(results)
     output = Path(job.output) if job.output else folder / "from_store"
     about = {"stores": str(folder), "evaluation": to_dict(config), "left_out": left_out}
     save_results(results, sets, output, about)

@@ -6,13 +6,12 @@ disappears between the lines.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from pipeline.common.text import Table, csv_text
 from shards.catalogue import LeftOut
 
 
@@ -45,18 +44,12 @@ class Summary:
         if self.seconds:
             speed = f"{self.images_opened / self.seconds:,.0f} images/s" if self.images_opened else ""
             lines.append(("seconds", f"{self.seconds:,.1f}", speed))
-        left = max(len(name) for name, _, _ in lines)
-        middle = max(len(value) for _, value, _ in lines)
-        return "\n".join(f"{name:<{left}}  {value:>{middle}}  {note}".rstrip() for name, value, note in lines)
+        return Table((), lines, (0, 2)).text()
 
 
 def report_bytes(left_out: Iterable[LeftOut]) -> bytes:
     """report.csv: file, city, place, reason; a line with an empty file is about a whole place."""
-    sink = io.StringIO(newline="")
-    writer = csv.writer(sink, lineterminator="\n")
-    writer.writerow(LeftOut._fields)
-    writer.writerows(sorted(left_out))
-    return sink.getvalue().encode()
+    return csv_text([LeftOut._fields, *sorted(left_out)]).encode()
 
 
 def reasons(left_out: Iterable[LeftOut]) -> dict[str, int]:

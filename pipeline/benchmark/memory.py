@@ -22,7 +22,7 @@ from torch.utils._pytree import tree_leaves
 
 from pipeline.benchmark.own_process import alone, peak
 from pipeline.benchmark.sizes import SIZES, Norm, Size, bare, batch, build
-from pipeline.benchmark.timing import table
+from pipeline.common.text import Table
 from pipeline.model.vpr import PlaceModel
 
 
@@ -136,7 +136,7 @@ def measure(name: str, batches: tuple[int, ...], limit: float) -> str:
             lines.append(
                 (way, f"{images:,}", _mb(counted.kept), _mb(counted.peak), _mb(counted.peak / images), ran)
             )  # fmt: skip
-    return table(lines)
+    return Table(lines[0], lines[1:]).text()
 
 
 def _mb(n: float) -> str:

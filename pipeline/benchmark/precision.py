@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pipeline.benchmark.sizes import Size, batch, build
 from pipeline.benchmark.step import autocast
-from pipeline.benchmark.timing import table
+from pipeline.common.text import Table
 from pipeline.model.vpr import PlaceModel
 from pipeline.training.loss import MultiSimilarityLoss
 
@@ -107,4 +107,4 @@ def show(found: dict[str, Errors]) -> str:
     for name, e in found.items():
         numbers = (e.descriptor, e.descriptor_max, e.similarity, e.loss, e.gradient, e.worst)
         lines.append((name, *(f"{n:.1e}" for n in numbers), e.worst_name if e.finite else "not finite"))
-    return table(lines)
+    return Table(lines[0], lines[1:]).text()

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 
 import torch
 
+from pipeline.common.text import Table
+
 HEADER = ("", "ms", "per second", "speed (lowest-highest)")
 
 
@@ -89,7 +91,7 @@ def from_seconds(title: str, seconds: Mapping[str, list[float]], items: int) -> 
 
 def show(comparisons: list[Comparison]) -> str:
     """All comparisons as one aligned table."""
-    lines: list[tuple[str, ...]] = [HEADER]
+    lines: list[tuple[str, ...]] = []
     for comparison in comparisons:
         lines.append((comparison.title, "", "", ""))
         for number, row in enumerate(comparison.rows):
@@ -97,16 +99,7 @@ def show(comparisons: list[Comparison]) -> str:
             lines.append(
                 (f"  {row.name}", f"{1e3 * row.seconds:,.1f}", f"{row.per_second:,.0f}", ratio if number else "1")
             )
-    return table(lines)
-
-
-def table(lines: list[tuple[str, ...]]) -> str:
-    """Rows as columns: the first to the left, the others to the right."""
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    return "\n".join(
-        "  ".join(cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(zip(line, widths, strict=True)))
-        for line in lines
-    )
+    return Table(HEADER, lines).text()
 
 
 def machine(device: torch.device) -> str:

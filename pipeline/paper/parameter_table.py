@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import torch
 
+from pipeline.common.text import Table
 from pipeline.config import ModelConfig
 from pipeline.model.variants import variant
 from pipeline.model.vpr import build_model, parameter_counts
@@ -60,30 +61,15 @@ def table(names: Iterable[str], image_size: int = 224) -> list[Row]:
     return [row(name, variant(name), image_size) for name in names]
 
 
-def cells(rows: Iterable[Row]) -> list[list[str]]:
-    """Heading and rows as text, in millions; the paper's figures in brackets where they are known."""
-    lines = [["Method", *(f"{column} (paper)" for column in COLUMNS)]]
+def printed(rows: Iterable[Row]) -> Table:
+    """Millions of parameters; the paper's figures in brackets where they are known."""
+    lines = []
     for counted in rows:
         known = PAPER.get(counted.name, (None,) * len(COLUMNS))
         lines.append([counted.name, *map(_cell, counted.counts(), known)])
-    return lines
+    return Table(["Method", *(f"{column} (paper)" for column in COLUMNS)], lines)
 
 
 def _cell(count: int, paper: float | None) -> str:
     ours = "0" if count == 0 else f"{count / 1e6:.1f}" if count >= 50_000 else "<0.1"
     return ours if paper is None else f"{ours} ({paper:.1f})"
-
-
-def as_text(rows: Iterable[Row]) -> str:
-    """Aligned, for the terminal."""
-    lines = cells(rows)
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    text = ["  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths, strict=True)))
-            for line in lines]  # fmt: skip
-    return "\n".join(["Parameters in millions", text[0], "-" * len(text[0]), *text[1:]])
-
-
-def as_markdown(rows: Iterable[Row]) -> str:
-    """A markdown table."""
-    heading, *lines = ["| " + " | ".join(line) + " |" for line in cells(rows)]
-    return "\n".join([heading, "|---" + "|---:" * len(COLUMNS) + "|", *lines]) + "\n"

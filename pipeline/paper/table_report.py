@@ -6,10 +6,11 @@ and standard deviation are over seeds (trainings), never over sets or groupings.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
+from pipeline.common.text import Table, csv_text, markdown_text, printable
 from pipeline.evaluation.sets.registry import published_name
 from pipeline.paper.chart import draw
 from pipeline.paper.study import Study
@@ -19,8 +20,8 @@ SHOWN = (1, 5)
 """The N of Recall@N in the printed table; the CSV has all."""
 
 
-def cells(study: Study, set_name: str) -> list[list[str]]:
-    """The table of one set, its head first: row, what it varied here, our recalls by grouping, the paper's."""
+def table(study: Study, set_name: str) -> Table:
+    """The table of one set: row, what it varied here, our recalls by grouping, the paper's."""
     loaded, protocols = study.sets[set_name], by_row(study, set_name)
     groupings = list(dict.fromkeys(g for row in protocols.values() for g in row))
     sizes = {g: {row[g].group_size for row in protocols.values() if g in row} for g in groupings}
@@ -34,7 +35,7 @@ def cells(study: Study, set_name: str) -> list[list[str]]:
         named = g if g == "single" or len(sizes[g]) > 1 else f"{g}{next(iter(sizes[g]))}"
         head.append(named)
     head.append(f"paper: {theirs}, {batch}")
-    table = [head]
+    rows = []
     for row in study.table.rows:
         line = [row, *([study.settings.get(row, "")] if with_settings else [])]
         for g in groupings:
@@ -45,8 +46,8 @@ def cells(study: Study, set_name: str) -> list[list[str]]:
         figure = paper_figure(study, row, loaded)
         at = [None if figure is None else figure.at(k) for k in SHOWN]
         line.append(_cell(["-" if found is None else f"{found:.1f}" for found in at]))
-        table.append(line)
-    return table
+        rows.append(line)
+    return Table(head, rows)
 
 
 def _cell(figures: list[str]) -> str:
@@ -89,59 +90,52 @@ def _fewer(study: Study) -> bool:
     return any(len(v) < len(study.seeds) for by_n in study.values.values() for v in by_n.values())
 
 
-def terminal(study: Study) -> str:
-    """All sets' tables as aligned text, the notes below."""
-    out = [study.table.title, ""]
+def show(study: Study) -> None:
+    """Prints the tables of all sets, the notes below."""
+    print(study.table.title)
     for set_name in study.sets:
-        table = cells(study, set_name)
-        widths = [max(len(line[i]) for line in table) for i in range(len(table[0]))]
-        rows = [
-            "  ".join(
-                c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths, strict=True))
-            ).rstrip()
-            for line in table
-        ]
-        out += [heading(study, set_name), rows[0], "  ".join("-" * w for w in widths), *rows[1:], ""]
-    return "\n".join([*out, *notes(study)])
+        print("\n" + printable(heading(study, set_name)))
+        table(study, set_name).print()
+    print("\n" + "\n".join(map(printable, notes(study))))
 
 
 def markdown(study: Study) -> str:
     """The same as markdown."""
     out = [f"# {study.table.title}", ""]
     for set_name in study.sets:
-        head, *rows = cells(study, set_name)
-        rule = [":---", *("---:" for _ in head[1:])]
-        out += [heading(study, set_name), ""]
-        out += ["| " + " | ".join(line) + " |" for line in [head, rule, *rows]] + [""]
-    return "\n".join([*out, *(f"- {note}" for note in notes(study))]) + "\n"
+        out += [markdown_text(heading(study, set_name)), "", table(study, set_name).markdown()]
+    return "\n".join([*out, *(f"- {markdown_text(note)}" for note in notes(study))]) + "\n"
 
 
 def write(study: Study, folder: Path) -> None:
     """`table.md`, `table.csv` (one line a row, set, protocol and N) and `table.png` in `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "table.md").write_text(markdown(study))
-    with (folder / "table.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        fields = ["row", "here", "set", "protocol", "n", "mean", "deviation", "seeds", "paper", "paper_set"]
-        writer.writerow(["table", *fields, "paper_protocol", "paper_table"])
-        for set_name, loaded in study.sets.items():
-            for row, protocols in by_row(study, set_name).items():
-                figure = paper_figure(study, row, loaded)
-                for protocol in protocols.values():
-                    for k in study.values.get((row, loaded.name, protocol.name), {}):
-                        found = value(study, row, loaded, protocol, k)
-                        if found is None:
-                            continue
-                        spread = "" if found.deviation is None else found.deviation
-                        seeds = " ".join(str(v) for v in found.seeds)
-                        ours = [study.settings.get(row, ""), loaded.name, protocol.name, k, found.mean, spread, seeds]
-                        theirs: list[object] = ["", "", "", ""]
-                        if figure is not None:
-                            told = figure.at(k)
-                            size = f"ordered{figure.group_size}"
-                            theirs = ["" if told is None else told, paper_set(study, loaded), size, figure.table]
-                        writer.writerow([study.name, row, *ours, *theirs])
+    (folder / "table.csv").write_text(csv_text(_long_form(study)))
     draw(study, folder / "table.png")
+
+
+def _long_form(study: Study) -> Iterator[list[object]]:
+    """A line a row, set, protocol and N, its head first."""
+    fields = ["row", "here", "set", "protocol", "n", "mean", "deviation", "seeds", "paper", "paper_set"]
+    yield ["table", *fields, "paper_protocol", "paper_table"]
+    for set_name, loaded in study.sets.items():
+        for row, protocols in by_row(study, set_name).items():
+            figure = paper_figure(study, row, loaded)
+            for protocol in protocols.values():
+                for k in study.values.get((row, loaded.name, protocol.name), {}):
+                    found = value(study, row, loaded, protocol, k)
+                    if found is None:
+                        continue
+                    spread = "" if found.deviation is None else found.deviation
+                    seeds = " ".join(str(v) for v in found.seeds)
+                    ours = [study.settings.get(row, ""), loaded.name, protocol.name, k, found.mean, spread, seeds]
+                    theirs: list[object] = ["", "", "", ""]
+                    if figure is not None:
+                        told = figure.at(k)
+                        size = f"ordered{figure.group_size}"
+                        theirs = ["" if told is None else told, paper_set(study, loaded), size, figure.table]
+                    yield [study.name, row, *ours, *theirs]
 
 
 def costs(study: Study, images_per_second: float | None = None) -> str:

@@ -6,7 +6,6 @@ different protocols are different rows, never averaged or mixed.
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.common.errors import UsageError
+from pipeline.common.text import Table
 from pipeline.training.tracking import open_client
 
 RECALL = re.compile(r"^(?P<kind>\w+)/(?P<set>.+)\.(?P<protocol>[^.]+)\.recall_at_(?P<k>\d+)$")
@@ -123,45 +123,19 @@ def best(metric: str, values: Sequence[float | None]) -> set[int]:
     return {i for i, v in enumerate(values) if v == target}
 
 
-def cells(runs: Sequence[Run]) -> list[list[str]]:
-    """The table: a head of run names, metric rows with the best marked `*`, then the settings that differ."""
-    table = [["", *[run.name for run in runs]]]
+def table(runs: Sequence[Run]) -> Table:
+    """A head of run names, metric rows with the best marked, then the settings that differ."""
+    rows: list[list[str]] = []
+    marked: list[tuple[int, int]] = []
     for metric, values in metric_rows(runs):
-        winners = best(metric, values)
+        marked += [(len(rows), i + 1) for i in best(metric, values)]
         digits = 4 if metric == "train/loss" else 1
-        row = ["-" if v is None else f"{v:.{digits}f}" + (" *" if i in winners else "") for i, v in enumerate(values)]
-        table.append([metric, *row])
+        rows.append([metric, *("-" if v is None else f"{v:.{digits}f}" for v in values)])
     for key, values_of_setting in differing_settings(runs):
-        table.append([key, *values_of_setting])
+        rows.append([key, *values_of_setting])
     if any(run.status != "FINISHED" for run in runs):
-        table.append(["status", *[run.status.lower() for run in runs]])
-    return table
-
-
-def as_text(table: list[list[str]]) -> str:
-    """Aligned columns for a terminal."""
-    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
-    lines = ["  ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
-             for row in table]  # fmt: skip
-    lines.insert(1, "  ".join("-" * w for w in widths))
-    return "\n".join(lines)
-
-
-def as_markdown(table: list[list[str]]) -> str:
-    """A markdown table, the best in bold."""
-
-    def cell(text: str) -> str:
-        return f"**{text[:-2]}**" if text.endswith(" *") else text.replace("|", "\\|")
-
-    head, *rows = [[cell(c) for c in row] for row in table]
-    rule = ["---", *["---:" for _ in head[1:]]]
-    return "\n".join("| " + " | ".join(row) + " |" for row in [head, rule, *rows]) + "\n"
-
-
-def write_csv(table: list[list[str]], path: Path) -> None:
-    """The same table, marks left out, for a spreadsheet."""
-    with path.open("w", newline="") as file:
-        csv.writer(file).writerows([[c.removesuffix(" *") for c in row] for row in table])
+        rows.append(["status", *[run.status.lower() for run in runs]])
+    return Table(["", *[run.name for run in runs]], rows, marked=marked)
 
 
 def draw_curves(runs: Sequence[Run], path: Path) -> bool:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.common.errors import UsageError
+from pipeline.common.text import Table
 from pipeline.model.backbones.transformer import Backbone
 from pipeline.model.batch_norm import GlobalBatchNorm2d
 from pipeline.model.vpr import PlaceModel, parameter_counts
@@ -145,12 +146,12 @@ def kept_keys(sizes: StepSizes, w: int) -> int:
     return sizes.layers * sizes.images * w * sizes.regions * 2 * sizes.dim * sizes.key_bytes
 
 
-def table(sizes: StepSizes, worlds: Sequence[int]) -> list[list[str]]:
-    """Header and a row for each W: MB received by part, keys kept, GFLOP by part."""
+def table(sizes: StepSizes, worlds: Sequence[int]) -> Table:
+    """A row for each W: MB received by part, keys kept, GFLOP by part."""
     parts = ["keys and values", "descriptors", "BatchNorm", "gradients"]
     head = ["W", "B", *(f"{part} MB" for part in parts), "all MB", "keys kept MB"]
     head += ["backbone GFLOP", "own rows GFLOP", "redundant form GFLOP"]
-    rows = [head]
+    rows = []
     for w in worlds:
         found = collectives(sizes, w)
         flops = forward_flops(sizes, w)
@@ -160,4 +161,4 @@ def table(sizes: StepSizes, worlds: Sequence[int]) -> list[list[str]]:
             [str(w), f"{sizes.images * w:,}", *(f"{n / 1e6:,.1f}" for n in numbers)]
             + [f"{flops[part] / 1e9:,.0f}" for part in ("backbone", "own rows", "redundant")]
         )
-    return rows
+    return Table(head, rows, left=())

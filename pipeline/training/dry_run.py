@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 
+from pipeline.common.text import Table
 from pipeline.config import RunConfig
 from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
@@ -101,5 +102,4 @@ def _gb(n: float) -> str:
 
 def show(rows: list[tuple[str, str]]) -> str:
     """The rows as an aligned text table."""
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"  {name:<{width}}  {value}" for name, value in rows)
+    return Table((), [(f"  {name}", value) for name, value in rows], (0, 1)).text()

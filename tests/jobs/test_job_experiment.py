@@ -191,8 +191,9 @@ def test_values_show_mean_and_spread_over_seeds(root: Path) -> None:
     name = next(iter(filled.sets.values())).name
     filled.values["5x5", name, "ordered16"] = {1: [40.0, 44.0], 5: [80.0, 80.0]}
     filled.values["3x3", name, "ordered16"] = {1: [40.0], 5: [80.0]}
-    head, *rows = table_report.cells(filled, str(root / "evaluation"))
-    assert head == ["row", "single", "shuffled16", "ordered16", "paper: pitts30k, ordered8"]
+    table = table_report.table(filled, str(root / "evaluation"))
+    rows = table.rows
+    assert table.head == ["row", "single", "shuffled16", "ordered16", "paper: pitts30k, ordered8"]
     assert rows[2] == ["5x5", "-", "-", "42.0 ±2.8 / 80.0 ±0.0", "94.7 / 97.3"]
     assert rows[1][3] == "40.0 / 80.0 (n 1)"
     assert table_report.markdown(filled).count("\n| ") == len(["head", "rule", *rows])

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.common.text import printable
 from pipeline.evaluation.evaluate import Result
 from pipeline.evaluation.report import figures
 from pipeline.evaluation.report.error_plots import error_plot
-from pipeline.evaluation.report.tables import notes, rows
+from pipeline.evaluation.report.tables import notes, table
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 CSS = """
@@ -133,7 +134,7 @@ def write_report(
     parts = [
         f"<h1>{html.escape(title)}</h1><p class=about>{facts}</p><nav>{links}</nav>",
         f"<h2>Recall and its protocol</h2><div class=card>{_table(results)}<ul>",
-        *(f"<li>{html.escape(note.replace('* best', 'green: best'))}</li>" for note in notes(results)),
+        *(f"<li>{html.escape(printable(note))}</li>" for note in notes(results)),
         "</ul></div>",
     ]
     for name in names:
@@ -151,22 +152,20 @@ def write_report(
 
 
 def _table(results: Sequence[Result]) -> str:
-    table = rows(results)
-    if not table:
+    if not results:
         return "<p>no results</p>"
-    columns = list(table[0])
-    lines = ["<table><tr>" + "".join(f"<th>{html.escape(c)}</th>" for c in columns) + "</tr>"]
+    found = table(results)
+    lines = ["<table><tr>" + "".join(f"<th>{html.escape(c)}</th>" for c in found.head) + "</tr>"]
     previous = ""
-    for row in table:
-        first = row["set"] != previous
+    for i, row in enumerate(found.rows):
+        first = row[0] != previous
         cells = []
-        for column in columns:
-            text = row.get(column, "")
-            kind = "best" if text.endswith("*") else column
-            shown = "" if column == "set" and not first else text.rstrip("*")
-            cells.append(f'<td class="{kind if kind in ("best", "set") else ""}">{html.escape(shown)}</td>')
+        for n, text in enumerate(row):
+            kind = "best" if (i, n) in found.marked else "set" if n == 0 else ""
+            told = "" if n == 0 and not first else printable(text)
+            cells.append(f'<td class="{kind}">{html.escape(told)}</td>')
         lines.append(f'<tr class="{"first" if first and previous else ""}">' + "".join(cells) + "</tr>")
-        previous = row["set"]
+        previous = row[0]
     return "".join([*lines, "</table>"])
 
 

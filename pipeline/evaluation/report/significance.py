@@ -12,7 +12,6 @@ disagreeing queries). Both take queries as independent; neighbouring frames of a
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.common.text import Table, csv_text, shown
 from pipeline.evaluation.predictions import Predictions, load_predictions
 
 SAMPLES = 10_000
@@ -135,51 +135,41 @@ def compare_folders(
 
 def as_text(found: Sequence[Difference]) -> str:
     """Lines by pair of runs, set and protocol."""
-    lines: list[str] = []
-    heads: dict[tuple[str, str], None] = {}
-    for d in found:
-        if d.runs not in heads:
-            heads[d.runs] = None
-            lines.append(
-                f"{'' if len(heads) == 1 else chr(10)}{d.runs[0]} -> {d.runs[1]}, same queries, 95 % intervals"
-            )
-        lines.append(f"  {d.set_name}  {d.protocol}  {d.text}  ({d.gained} gained, {d.lost} lost of {d.queries:,})")
-    return "\n".join(lines)
+    parts: list[str] = []
+    for runs, each in itertools.groupby(found, key=lambda d: d.runs):
+        rows = [
+            [f"  {d.set_name}", d.protocol, d.text, f"({d.gained} gained, {d.lost} lost of {d.queries:,})"]
+            for d in each
+        ]
+        head = f"{shown(runs[0])} -> {shown(runs[1])}, same queries, 95 % intervals"
+        parts.append(head + "\n" + Table((), rows, range(4)).text())
+    return "\n\n".join(parts)
 
 
 def as_markdown(found: Sequence[Difference]) -> str:
     """A table, the real differences in bold."""
-    lines = ["| runs | set | protocol | N | recall, % | difference, 95 % interval | |", "|---|---|---|---|---|---|---|"]
-    for d in found:
-        told = "**real**" if d.real else "not distinguishable"
-        lines.append(
-            f"| {d.runs[0]} -> {d.runs[1]} | {d.set_name} | {d.protocol} | {d.k} | {d.recalls[0]:.1f} -> "
-            f"{d.recalls[1]:.1f} | {d.value:+.1f} [{d.low:+.1f}, {d.high:+.1f}] | {told} |"
-        )
-    return "\n".join(lines) + "\n"
+    head = ["runs", "set", "protocol", "N", "recall, %", "difference, 95 % interval", "judgement"]
+    rows = [
+        [
+            " -> ".join(d.runs), d.set_name, d.protocol, str(d.k), f"{d.recalls[0]:.1f} -> {d.recalls[1]:.1f}",
+            f"{d.value:+.1f} [{d.low:+.1f}, {d.high:+.1f}]", "real" if d.real else "not distinguishable",
+        ]
+        for d in found
+    ]  # fmt: skip
+    return Table(head, rows, (0, 1, 2, 6), [(i, 6) for i, d in enumerate(found) if d.real]).markdown()
 
 
 def write_csv(found: Sequence[Difference], path: Path) -> None:
     """One line a difference."""
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        named = [
-            "first",
-            "second",
-            "set",
-            "protocol",
-            "n",
-            "recall_first",
-            "recall_second",
-            "difference",
-            "low",
-            "high",
-        ]
-        writer.writerow([*named, "gained", "lost", "queries", "p_value", "real"])
-        for d in found:
-            interval = [*d.recalls, d.value, d.low, d.high]
-            counts = [d.gained, d.lost, d.queries]
-            writer.writerow([*d.runs, d.set_name, d.protocol, d.k, *interval, *counts, d.p_value, d.real])
+    lines: list[list[object]] = [
+        ["first", "second", "set", "protocol", "n", "recall_first", "recall_second", "difference", "low", "high",
+         "gained", "lost", "queries", "p_value", "real"]
+    ]  # fmt: skip
+    for d in found:
+        interval = [*d.recalls, d.value, d.low, d.high]
+        counts = [d.gained, d.lost, d.queries]
+        lines.append([*d.runs, d.set_name, d.protocol, d.k, *interval, *counts, d.p_value, d.real])
+    path.write_text(csv_text(lines))
 
 
 def _in(folder: Path) -> list[str]:

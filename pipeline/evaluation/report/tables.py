@@ -6,13 +6,13 @@ paper's figures, where it gives any, stand in the row of the same protocol, or i
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.common.errors import DataError
+from pipeline.common.text import Table, csv_text, markdown_text, printable
 from pipeline.evaluation.evaluate import Result
 from pipeline.evaluation.protocol import metric_name
 from pipeline.evaluation.report.paper_numbers import FIGURES, HEADLINE, Reported, reported
@@ -26,10 +26,11 @@ def paper_figures(result: Result) -> Reported | None:
     return FIGURES.get((result.set_name, HEADLINE, name))
 
 
-def rows(results: Sequence[Result]) -> list[dict[str, str]]:
-    """One dict of texts a row: set, protocol, the recalls, counts, the paper's recalls. Best of a set marked `*`."""
+def table(results: Sequence[Result]) -> Table:
+    """A row a set and protocol: the recalls, counts, the paper's recalls. The best of a set is marked."""
     ks = sorted({k for result in results for k in result.recalls})
-    table: list[dict[str, str]] = []
+    rows: list[dict[str, str]] = []
+    marked: set[tuple[int, str]] = set()
     for set_name, group in _by_set(results):
         scored = [result for result in group if result.recalls]
         best = {k: max(r.recalls[k] for r in scored if k in r.recalls) for k in ks} if scored else {}
@@ -40,59 +41,45 @@ def rows(results: Sequence[Result]) -> list[dict[str, str]]:
             row = {"set": set_name, "protocol": result.protocol.name}
             for k in ks:
                 value = result.recalls.get(k)
-                mark = "*" if len(scored) > 1 and value is not None and value == best[k] else ""
-                row[f"R@{k}"] = "-" if value is None else f"{value:.1f}{mark}"
+                row[f"R@{k}"] = _percent(value)
+                if len(scored) > 1 and value is not None and value == best[k]:
+                    marked.add((len(rows), f"R@{k}"))
             row["queries"] = f"{result.queries:,}"
             row["database"] = f"{result.database:,}"
             row["no positive"] = f"{result.without_positives:,}"
             row["paper R@1/5/10"] = _cells(paper)
-            table.append(row)
+            rows.append(row)
         headline = reported(set_name)
         if headline is not None and not matched:
             theirs = f"paper: ordered{headline.group_size}, PCA 4096"
             recalls = {f"R@{k}": _percent(headline.at(k)) for k in ks}
-            table.append({"set": set_name, "protocol": theirs, **recalls, "paper R@1/5/10": _cells(headline)})
-    if not any(row.get("paper R@1/5/10", "-") != "-" for row in table):
-        for row in table:
-            row.pop("paper R@1/5/10", None)
-    return table
+            rows.append({"set": set_name, "protocol": theirs, **recalls, "paper R@1/5/10": _cells(headline)})
+    columns = list(rows[0]) if rows else ["set", "protocol"]
+    if not any(row["paper R@1/5/10"] != "-" for row in rows):
+        columns = [c for c in columns if c != "paper R@1/5/10"]
+    return Table(
+        head=columns,
+        rows=[[row.get(c, "") for c in columns] for row in rows],
+        left=(0, 1),
+        marked={(row, columns.index(c)) for row, c in marked},
+        grouped=True,
+    )
 
 
-def terminal(results: Sequence[Result]) -> str:
-    """The table as aligned text with rules between sets, the protocols spelt out below it."""
-    table = rows(results)
-    if not table:
-        return "no results"
-    columns = list(table[0])
-    widths = {c: max(len(c), *(len(row.get(c, "")) for row in table)) for c in columns}
-
-    def line(row: dict[str, str]) -> str:
-        cells = (row.get(c, "").ljust(widths[c]) if c in ("set", "protocol") else _right(row, c) for c in columns)
-        return "  ".join(cells).rstrip()
-
-    def _right(row: dict[str, str], column: str) -> str:
-        # the mark of the best hangs to the right, so that the digits stand in line
-        text = row.get(column, "")
-        return (text if text.endswith("*") or not column.startswith("R@") else text + " ").rjust(widths[column] + 1)
-
-    rule = "-" * (sum(widths[c] + 3 for c in columns) - 2 - 2)
-    out = [line({c: c for c in columns}), rule]
-    previous = table[0]["set"]
-    for row in table:
-        if row["set"] != previous:
-            out.append(rule)
-            previous, shown = row["set"], row
-        else:
-            shown = row if row is table[0] else {**row, "set": ""}
-        out.append(line(shown))
-    return "\n".join([*out, rule, *notes(results)])
+def show(results: Sequence[Result]) -> None:
+    """Prints the table and, below it, its notes."""
+    if not results:
+        print("no results")
+        return
+    table(results).print()
+    print("\n" + "\n".join(map(printable, notes(results))))
 
 
 def notes(results: Sequence[Result]) -> list[str]:
     """What the short names of protocols mean, which queries have no positive, and remarks: each once."""
     lines: dict[str, None] = {}
     if any(len(group) > 1 for _, group in _by_set(results)):
-        lines["* best of its set; recalls in percent"] = None
+        lines["the best of each set is marked; recalls in percent"] = None
     for result in results:
         lines[f"{result.protocol.name}: {result.protocol.describe()}"] = None
     for result in results:
@@ -106,14 +93,9 @@ def notes(results: Sequence[Result]) -> list[str]:
 
 def markdown(results: Sequence[Result]) -> str:
     """The table and its notes as markdown."""
-    table = rows(results)
-    if not table:
+    if not results:
         return "no results\n"
-    columns = list(table[0])
-    align = [":---" if c in ("set", "protocol") else "---:" for c in columns]
-    body = [[row.get(c, "").replace("*", r"\*") for c in columns] for row in table]
-    lines = ["| " + " | ".join(cells) + " |" for cells in [columns, align, *body]]
-    return "\n".join([*lines, "", *(f"- {note.replace('*', chr(92) + '*')}" for note in notes(results))]) + "\n"
+    return "\n".join([table(results).markdown(), *(f"- {markdown_text(note)}" for note in notes(results))]) + "\n"
 
 
 def as_dicts(results: Iterable[Result]) -> list[dict[str, Any]]:
@@ -158,15 +140,14 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def write_csv(results: Sequence[Result], path: Path) -> None:
     """One line for each set, protocol and N."""
+    settings = list(results[0].protocol.to_dict()) if results else []
+    lines: list[list[Any]] = [["set", "protocol", "n", "recall", "queries", "database", "no_positive", *settings]]
+    for r in results:
+        for k, value in r.recalls.items():
+            counts = [r.queries, r.database, r.without_positives]
+            lines.append([r.set_name, r.protocol.name, k, value, *counts, *r.protocol.to_dict().values()])
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        settings = list(results[0].protocol.to_dict()) if results else []
-        writer.writerow(["set", "protocol", "n", "recall", "queries", "database", "no_positive", *settings])
-        for r in results:
-            for k, value in r.recalls.items():
-                counts = [r.queries, r.database, r.without_positives]
-                writer.writerow([r.set_name, r.protocol.name, k, value, *counts, *r.protocol.to_dict().values()])
+    path.write_text(csv_text(lines))
 
 
 def _by_set(results: Sequence[Result]) -> list[tuple[str, list[Result]]]:

@@ -52,10 +52,13 @@ def test_newest_run_of_each_name(store: Path, monkeypatch: pytest.MonkeyPatch) -
     assert runs_of(store, runs[1].run_id, "a")[0].name == "b"
 
 
-def test_table_marks_the_best_and_shows_only_what_differs(store: Path, tmp_path: Path) -> None:
+def test_table_marks_the_best_and_shows_only_what_differs(store: Path) -> None:
     runs = runs_of(store, "a", "b")
-    table = comparison.cells(runs)
-    rows = {row[0]: row[1:] for row in table}
+    table = comparison.table(runs)
+    rows = {
+        row[0]: [cell + " *" * ((i, n) in table.marked) for n, cell in enumerate(row[1:], 1)]
+        for i, row in enumerate(table.rows)
+    }
     assert rows["evaluation/city.single.recall_at_1"] == ["50.0", "60.0 *"]
     assert rows["evaluation/city.single.recall_at_5"] == ["80.5 *", "70.2"]
     assert rows["evaluation/city.single.recall_at_10"] == ["99.0", "99.0"], "a tie has no winner"
@@ -63,14 +66,11 @@ def test_table_marks_the_best_and_shows_only_what_differs(store: Path, tmp_path:
     assert rows["seed"] == ["0", "1"]
     assert "data.places_per_batch" not in rows
     assert "name" not in rows
-    names = [row[0] for row in table[1:]]
+    names = [row[0] for row in table.rows]
     ordered = [n for n in names if n.startswith("evaluation/")]
     assert [n.rsplit("_", 1)[1] for n in ordered] == ["1", "5", "10"], "N in numeric order"
-    assert "**60.0**" in comparison.as_markdown(table)
-    comparison.write_csv(table, tmp_path / "table.csv")
-    with (tmp_path / "table.csv").open() as file:
-        assert next(iter(csv.reader(file))) == ["", "a", "b"]
-    assert len({len(line) for line in comparison.as_text(table).splitlines()}) == 1, "columns are aligned"
+    assert "**60.0**" in table.markdown()
+    assert next(csv.reader(table.csv().splitlines())) == ["", "a", "b"]
 
 
 def test_curves_are_drawn(store: Path, tmp_path: Path) -> None:
