@@ -1,19 +1,27 @@
-"""The global batch over processes: slices, gather with gradient, global sums. Identity at world size 1.
+"""The global batch over processes: slices, gather with gradient, global sums, agreement. Identity at world size 1.
 
 Invariant: with equal slices on every rank and a data-parallel wrapper that *averages* gradients (DDP, FSDP2, ZeRO),
 a loss that is each rank's mean over its own images has exactly the gradient of the mean over the global batch.
 The backward of `gather` is therefore a plain sum over ranks (reduce-scatter), with no extra factor.
+
+What can fail or be decided on one rank alone goes through `agree`, `agreed` or `on_rank_0`: all ranks then end with
+the same error, or goes on with the same decision.
 
 Shapes: `B` images in the global batch, `b = B / W` on this rank, rank r holds rows [r*b, (r+1)*b).
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
+
+from pipeline.common.errors import Unexpected, UsageError, UserError, told
+
+Value = TypeVar("Value")
 
 
 def is_distributed() -> bool:
@@ -112,6 +120,83 @@ def barrier() -> None:
         dist.barrier()
 
 
+def agree(problem: BaseException | None = None, notice: int = 0, what: str = "") -> int:
+    """Ends every rank alike where one has a problem; otherwise returns the largest `notice`. Collective.
+
+    The happy path costs one all-reduce of one integer; texts are gathered only when there is a problem.
+
+    Args:
+        problem: what this rank's work raised, or None.
+        notice: a small non-negative number that all ranks should know ("asked to stop"); the largest counts.
+        what: what was being done, for errors that name no file ("writing the checkpoint outputs/x").
+
+    Raises:
+        UserError: the same class and message on all ranks, each text after the rank it comes from. A full disk, a
+            missing permission and the like are `DataError` (`errors.told`). An error that no user can mend keeps its
+            traceback on its own rank and is `Unexpected` on the others.
+    """
+    mine = None if problem is None else told(problem, what)
+    if not is_distributed():
+        if problem is not None:
+            raise (mine if mine is not None else problem)
+        return notice
+    largest = torch.tensor([_PROBLEM if problem is not None else notice], device=_device())
+    dist.all_reduce(largest, op=dist.ReduceOp.MAX)
+    if int(largest.item()) != _PROBLEM:
+        return int(largest.item())
+    record = None if problem is None else _record(problem, mine)
+    records: list[Any] = [None] * world_size()
+    dist.all_gather_object(records, record)
+    raise _joined({r: found for r, found in enumerate(records) if found is not None}, problem, mine)
+
+
+def agreed(work: Callable[[], Value], what: str = "") -> Value:
+    """This rank's `work()`; where it fails on any rank, the same error on every rank (`agree`). Collective.
+
+    `work` holds no collective that a failing rank would leave out: the others would wait for it.
+    """
+    problem: BaseException | None = None
+    value: Any = None
+    try:
+        value = work()
+    except Exception as error:
+        problem = error
+    agree(problem, what=what)
+    return value
+
+
+def on_rank_0(work: Callable[[], Value], what: str = "") -> Value:
+    """Rank 0's `work()` on all ranks: its value is sent (pickled, made by ourselves), its failure is everyone's."""
+    value: Any = None
+    problem: BaseException | None = None
+    if rank() == 0:
+        try:
+            value = work()
+        except Exception as error:
+            problem = error
+    mine = None if problem is None else told(problem, what)
+    if is_distributed():
+        box = [(value, None if problem is None else _record(problem, mine))]
+        dist.broadcast_object_list(box, src=0)
+        value, record = box[0]
+        if record is not None:
+            raise _joined({0: record}, problem, mine)
+    elif problem is not None:
+        raise (mine if mine is not None else problem)
+    return value
+
+
+def same(value: str, what: str) -> None:
+    """Asserts that all ranks hold rank 0's `value`. Collective.
+
+    Raises:
+        UsageError: on all ranks, naming those that differ and both values.
+    """
+    first = broadcast_object(value)
+    differs = None if value == first else UsageError(f"{what} is {value} here and {first} on rank 0")
+    agree(differs)
+
+
 def broadcast_object(value: Any) -> Any:
     """Rank 0's value on all ranks (a small picklable object made by ourselves)."""
     if not is_distributed():
@@ -121,10 +206,59 @@ def broadcast_object(value: Any) -> Any:
     return box[0]
 
 
-def any_rank(flag: bool, device: torch.device | str = "cpu") -> bool:
-    """Whether the flag is set on at least one rank; the same answer on all."""
+@torch.no_grad()
+def broadcast_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Rank 0's tensors by name on all ranks, on the CPU; what the others pass is ignored. Collective."""
     if not is_distributed():
-        return flag
-    value = torch.tensor([int(flag)], device=device)
-    dist.all_reduce(value, op=dist.ReduceOp.MAX)
-    return bool(value.item())
+        return dict(tensors)
+    shapes = broadcast_object({name: (tuple(t.shape), t.dtype) for name, t in tensors.items()})
+    sent: dict[str, Tensor] = {}
+    for name, (shape, dtype) in shapes.items():
+        first = rank() == 0
+        tensor = (
+            tensors[name].detach().to(_device()).contiguous()
+            if first
+            else torch.empty(shape, dtype=dtype, device=_device())
+        )
+        dist.broadcast(tensor, src=0)
+        sent[name] = tensor.cpu()
+    return sent
+
+
+_PROBLEM = 1 << 30  # above every notice
+
+
+class _Record(NamedTuple):
+    """One rank's problem on its way to the others."""
+
+    kind: type[UserError]
+    message: str
+
+
+def _record(problem: BaseException, mine: UserError | None) -> _Record:
+    if mine is not None:
+        return _Record(type(mine), str(mine))
+    line = (str(problem).strip().splitlines() or [""])[0]
+    return _Record(Unexpected, f"{type(problem).__name__}: {line} (its traceback is with that rank's messages)")
+
+
+def _joined(records: dict[int, _Record], problem: BaseException | None, mine: UserError | None) -> BaseException:
+    """What this rank raises; its own exception, with its traceback, where no user could mend that."""
+    if problem is not None and mine is None:
+        return problem
+    kinds = [record.kind for record in records.values()]
+    kind = Unexpected if Unexpected in kinds else kinds[0]
+    messages = list(dict.fromkeys(record.message for record in records.values()))
+    if len(messages) == 1 and len(records) == world_size():
+        error = kind(messages[0])
+    else:
+        error = kind("; ".join(f"rank {r}: {record.message}" for r, record in records.items()))
+    error.__cause__ = problem
+    return error
+
+
+def _device() -> torch.device:
+    """Where collectives want their tensors."""
+    if torch.cuda.is_available() and "nccl" in dist.get_backend():
+        return torch.device("cuda", torch.cuda.current_device())
+    return torch.device("cpu")

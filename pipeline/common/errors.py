@@ -33,3 +33,44 @@ class Preempted(UserError):
     """A signal asked to stop; everything is saved and the job should be requeued (exit code 75)."""
 
     exit_code = 75
+
+
+class Interrupted(UserError):
+    """Ctrl-C; everything is saved and the same command continues (exit code 130)."""
+
+    exit_code = 130
+
+
+class Unexpected(UserError):
+    """Another rank met an error that no user can mend; its traceback stands with that rank's messages (exit code 1)."""
+
+    exit_code = 1
+
+
+_LIBRARIES = (
+    "safetensors",
+    "safetensors_rust",
+    "pyarrow",
+)  # they wrap a full disk or a broken file in errors of their own
+_MISUSE = (TypeError, KeyError, IndexError, NotImplementedError)
+
+
+def told(error: BaseException, what: str = "") -> UserError | None:
+    """The one-line `UserError` for what a user can mend; None for an error of the program.
+
+    A full disk, a folder without permission, a read-only file system, an unreadable file and too little memory are
+    `DataError`, with the file where the error knows it and `what` was being done where it does not.
+    """
+    if isinstance(error, UserError):
+        return error
+    if isinstance(error, OSError) and not isinstance(error, (ConnectionError, TimeoutError, ChildProcessError)):
+        reason = error.strerror or str(error).splitlines()[0] if str(error) else type(error).__name__
+        named = f"{error.filename}: {reason}" if error.filename is not None else reason
+        if error.filename is not None and what and str(error.filename) in what:
+            named = reason
+        return DataError(f"{what}: {named}" if what else named)
+    library = type(error).__module__.split(".")[0] in _LIBRARIES and not isinstance(error, _MISUSE)
+    if isinstance(error, MemoryError) or library:
+        reason = "out of memory" if isinstance(error, MemoryError) else str(error).splitlines()[0]
+        return DataError(f"{what}: {reason}" if what else reason)
+    return None

@@ -17,6 +17,18 @@ def write_atomically(path: Path, data: bytes, temporary: Path | None = None) -> 
     sync_path(path.parent)
 
 
+def reserve(path: Path, size: int) -> None:
+    """Makes a file of `size` zero bytes that the disk really has: writing into a mapped hole of a full disk kills."""
+    with path.open("wb") as file:
+        if hasattr(os, "posix_fallocate"):
+            try:
+                os.posix_fallocate(file.fileno(), 0, size)
+            except OSError as error:
+                raise OSError(error.errno, error.strerror, str(path)) from None
+        else:
+            file.truncate(size)
+
+
 def usual_permissions(path: Path) -> None:
     """Those of a file that is simply opened: safetensors writes for the owner alone, and colleagues read these."""
     mask = os.umask(0)

@@ -19,8 +19,9 @@ import torch
 from torch import nn
 
 from pipeline.config import EvaluationConfig
+from pipeline.distributed import on_rank_0
 from pipeline.evaluation.describe.encode import evaluating
-from pipeline.evaluation.describe.sides import Engine, on_rank_0
+from pipeline.evaluation.describe.sides import Engine
 from pipeline.evaluation.protocol import Protocol, Side, protocols
 from pipeline.evaluation.recall import recall_at
 from pipeline.evaluation.search.exact import (

@@ -12,11 +12,10 @@ import sys
 import torch
 from torch import Tensor
 
-from pipeline.common.errors import UserError
 from pipeline.config import RunConfig
 from pipeline.data.images import normalise
 from pipeline.data.places import build_loader
-from pipeline.distributed import broadcast_object, rank
+from pipeline.distributed import broadcast_tensors, on_rank_0
 from pipeline.model.aggregators.netvlad import NetVLAD
 from pipeline.model.vpr import PlaceModel
 from shards.index import ShardIndex
@@ -36,21 +35,17 @@ def initialise(model: PlaceModel, index: ShardIndex, config: RunConfig, device: 
     """
     if not isinstance(model.pooling, NetVLAD):
         return
-    problem: UserError | None = None
-    if rank() == 0:
+
+    def cluster() -> None:
         print("clustering patch features for NetVLAD's start", file=sys.stderr, flush=True)
-        try:
-            features = sample_features(model, index, config, device)
-            model.pooling.to(device).cluster(features, config.seed)
-        except UserError as error:
-            problem = error
+        features = sample_features(model, index, config, device)
+        model.pooling.to(device).cluster(features, config.seed)
         model.cpu()
-    problem = broadcast_object(problem)
-    if problem is not None:
-        raise problem
+
+    on_rank_0(cluster, what="clustering patch features")
     with torch.no_grad():
-        for parameter in model.pooling.parameters():
-            parameter.copy_(torch.from_numpy(broadcast_object(parameter.detach().numpy())))
+        for name, value in broadcast_tensors(dict(model.pooling.named_parameters())).items():
+            model.pooling.get_parameter(name).copy_(value)
 
 
 @torch.no_grad()

@@ -12,19 +12,20 @@ import json
 import math
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pipeline.common.errors import DataError, Diverged, Preempted, UsageError, UserError
+from pipeline.common.errors import Diverged, Preempted, UsageError
 from pipeline.config import RunConfig, to_dict
 from pipeline.data.images import normalise
 from pipeline.data.places import Batch, build_loader
 from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
-from pipeline.distributed import any_rank, barrier, broadcast_object, rank, world_size
+from pipeline.distributed import agree, on_rank_0, rank, world_size
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.files import frozen_hash, load_trainable, save_model, saved_names
 from pipeline.training import checkpoint
@@ -214,17 +215,7 @@ class Trainer:
         self.state.world_size = world_size()
         self.state.scaler = self.engine.scaler()
         tensors, optimizer = self.engine.state(self.saved)
-        problem: UserError | None = None
-        if self.main:
-            try:
-                self._write(tensors, optimizer)
-            except OSError as error:
-                problem = DataError(f"cannot write a checkpoint under {self.run}: {error}")
-            except Diverged as error:
-                problem = error
-        problem = broadcast_object(problem)
-        if problem is not None:
-            raise problem
+        on_rank_0(partial(self._write, tensors, optimizer), what=f"writing a checkpoint under {self.run}")
 
     def _write(self, tensors: dict[str, Tensor], optimizer: dict[str, Tensor]) -> None:
         state, config = self.state, self.config
@@ -267,25 +258,19 @@ class Trainer:
         """The run's folder, its MLflow run and the sample log."""
         config = self.config
         note = self.run / "mlflow_run_id"
-        problem = None
-        if self.main:
+        self.tracker = Tracker(config, enabled=False)
+
+        def begin() -> None:
             self.run.mkdir(parents=True, exist_ok=True)
             self._forget_samples()
             (self.run / "config.json").write_text(json.dumps(to_dict(config), indent=1) + "\n")
             # a run killed before its first checkpoint left its id here
             known = self.state.run_id or (note.read_text().strip() if note.exists() else "")
-            try:
-                self.tracker = Tracker(config, known, config.tracking.enabled)
-                self.state.run_id = self.tracker.run_id
-                note.write_text(self.tracker.run_id)
-            except UsageError as error:
-                problem = error
-        else:
-            self.tracker = Tracker(config, enabled=False)
-        problem = broadcast_object(problem)
-        if problem is not None:
-            raise problem
-        barrier()
+            self.tracker = Tracker(config, known, config.tracking.enabled)
+            self.state.run_id = self.tracker.run_id
+            note.write_text(self.tracker.run_id)
+
+        on_rank_0(begin, what=f"opening the run's folder {self.run}")
         path = self.run / f"samples.rank{rank()}.jsonl"
         self.samples = path.open("a") if config.train.log_samples else None
 
@@ -307,7 +292,7 @@ class Trainer:
         return ""
 
     def _asked_to_stop(self) -> bool:
-        return any_rank(bool(self.stops), self.accelerator.device)
+        return bool(agree(notice=int(bool(self.stops))))
 
     def _preempted(self) -> Preempted:
         number = self.stops[0] if self.stops else "on another rank"

@@ -17,6 +17,7 @@ import json
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ import torch
 from torch import Tensor, nn
 
 from pipeline import distributed
-from pipeline.common.errors import DataError
+from pipeline.common.errors import DataError, told
+from pipeline.common.files import reserve
 from pipeline.common.progress import Progress
 from pipeline.config import EvaluationConfig
 from pipeline.data.images import load_image, normalise, to_input
@@ -72,8 +74,10 @@ class _Batches(torch.utils.data.Dataset[tuple[Tensor, str]]):
     def __getitem__(self, index: int) -> tuple[Tensor, str]:
         try:
             images = [to_input(load_image(self.paths[p]), self.size, self.resize) for p in self.batches[index]]
-        except (DataError, OSError) as error:
-            return torch.empty(0), str(error)
+        except Exception as error:  # as one line: torch would wrap it in a traceback
+            if (mended := told(error)) is None:
+                raise
+            return torch.empty(0), str(mended)
         return torch.stack(images), ""
 
 
@@ -138,7 +142,8 @@ def encode(
     positions = np.unique(np.concatenate(mine)) if mine else np.empty(0, np.int64)
     shape = (len(positions), *region_shape(model))
     dtype = _dtype(model)
-    values, resume = _allocate(shape, dtype, scratch, f"{key} {r}/{w} {zlib.crc32(positions.tobytes())}")
+    own_key = f"{key} {r}/{w} {zlib.crc32(positions.tobytes())}"
+    values, resume = distributed.agreed(partial(_allocate, shape, dtype, scratch, own_key), what=label)
     regions = Regions(positions, values)
 
     batches = [np.arange(s, min(s + config.batch, len(paths))) for s in range(0, len(paths), config.batch)]
@@ -148,17 +153,33 @@ def encode(
     size = int(model.image_size)  # type: ignore[arg-type]
     loader = iter(_loader(_Batches(paths, own, size, config.resize), config.workers))
     total = sum(len(batch) for batch in batches[first * w :])
+    problem: BaseException | None = None
     with Progress(label, total, "images", enabled=progress and r == 0) as bar:
         for step in range(first, steps):
             dealt = batches[step * w : (step + 1) * w]
-            images, problem = next(loader) if r < len(dealt) else (torch.zeros(1, 3, size, size), "")
-            raise_together(problem, device)
+            images = torch.zeros(1, 3, size, size)
+            if r < len(dealt) and problem is None:
+                images, problem = _next(loader)
+            distributed.agree(problem, what=label)
             encoded = _forward(model.encode, images, config, device, dtype)  # type: ignore[arg-type]
             gathered = distributed.gather_uneven(encoded if r < len(dealt) else encoded[:0])
-            regions.put(np.concatenate(dealt), gathered.cpu().numpy())
-            resume.advance(step + 1, values, final=step + 1 == steps)
+            try:
+                regions.put(np.concatenate(dealt), gathered.cpu().numpy())
+                resume.advance(step + 1, values, final=step + 1 == steps)
+            except OSError as error:  # told to the other ranks before the next forward pass
+                problem = error
             bar.advance(sum(len(batch) for batch in dealt))
+    distributed.agree(problem, what=label)
     return regions
+
+
+def _next(loader: Iterator[tuple[Tensor, str]]) -> tuple[Tensor, BaseException | None]:
+    """The next batch, or what is wrong with it."""
+    try:
+        images, broken = next(loader)
+    except Exception as error:
+        return torch.empty(0), error
+    return images, DataError(broken) if broken else None
 
 
 def describe_alone(model: nn.Module, photo: Path, resize: Any, precision: Any, device: torch.device) -> np.ndarray:
@@ -236,9 +257,8 @@ def correlate(
                 described = model.correlate(group.to(device), **together)  # type: ignore[operator]
                 own.append(described if j < len(block) else described[:0])
             gathered = distributed.gather_uneven(torch.cat(own))
-            if r == 0:
-                order = [block[j] for rank in range(w) for j in range(rank, len(block), w)]
-                keep(number, np.concatenate(order), gathered.cpu().numpy())
+            order = np.concatenate([block[j] for rank in range(w) for j in range(rank, len(block), w)])
+            distributed.on_rank_0(partial(keep, number, order, gathered.cpu().numpy()), what=label)
             bar.advance(sum(len(group) for group in block))
 
 
@@ -282,17 +302,6 @@ def _loader(dataset: _Batches, workers: int) -> torch.utils.data.DataLoader[tupl
     )
 
 
-def raise_together(problem: str, device: torch.device) -> None:
-    """Raises the same DataError on every rank as soon as one has a problem, so that none waits for ever."""
-    if not distributed.any_rank(bool(problem), device):
-        return
-    problems: list[str] = [problem]
-    if distributed.is_distributed():
-        problems = [""] * distributed.world_size()
-        torch.distributed.all_gather_object(problems, problem)
-    raise DataError("; ".join(p for p in problems if p))
-
-
 class _Resume:
     """How many steps of a scratch file are complete; nothing for regions in memory."""
 
@@ -322,4 +331,6 @@ def _allocate(shape: tuple[int, ...], dtype: torch.dtype, scratch: Path | None, 
     resume = _Resume(file.with_suffix(".json"), f"{key} {shape} {np.dtype(kind)}")
     if not file.is_file() or file.stat().st_size != size:
         resume.done = 0
-    return np.memmap(file, kind, mode="r+" if resume.done else "w+", shape=shape), resume
+    if not resume.done:
+        reserve(file, size)
+    return np.memmap(file, kind, mode="r+", shape=shape), resume

@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from pipeline import distributed
-from pipeline.common.errors import UserError
+from pipeline.common.files import reserve
 from pipeline.config import EvaluationConfig, to_dict
 from pipeline.evaluation.describe.encode import Block, Regions, blocks_of, calls_of, correlate, encode
 from pipeline.evaluation.describe.store import DescriptorStore, StoreKey, StoreWriter, files_digest
@@ -60,7 +60,7 @@ class Engine:
 
         done: dict[Protocol, frozenset[int]] = {}
         if self.config.store != "none" and self.output is not None:
-            files, done = on_rank_0(open_stores)
+            files, done = distributed.on_rank_0(open_stores, what=f"the descriptor store in {self.output}")
         missing = [p for p in chosen if len(done.get(p, ())) < len(blocks[p])]
         scratch = (self.output or self.temporary) / "scratch" / f"{evaluated.name}.{side}"
         regions = None
@@ -153,8 +153,9 @@ class _Held:
             if shape[0] * shape[1] * kind.itemsize <= IN_MEMORY:
                 self.array = np.empty(shape, kind)
             else:
-                file = tempfile.NamedTemporaryFile(dir=self.temporary, delete=False)  # noqa: SIM115
-                self.array = np.memmap(file, kind, mode="w+", shape=shape)
+                file = Path(tempfile.NamedTemporaryFile(dir=self.temporary, delete=False).name)  # noqa: SIM115
+                reserve(file, shape[0] * shape[1] * kind.itemsize)
+                self.array = np.memmap(file, kind, mode="r+", shape=shape)
         self.array[positions] = descriptors
 
     def blocks(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -163,18 +164,3 @@ class _Held:
 
 def _drop(number: int, positions: np.ndarray, descriptors: np.ndarray) -> None:
     """Ranks other than 0 keep nothing."""
-
-
-def on_rank_0(work: Callable[[], Any]) -> Any:
-    """Rank 0's result on all ranks; a `UserError` of rank 0 is raised on all, so that none waits for ever."""
-    value: Any = None
-    error: UserError | None = None
-    if distributed.rank() == 0:
-        try:
-            value = work()
-        except UserError as raised:
-            error = raised
-    value, error = distributed.broadcast_object((value, error))
-    if error is not None:
-        raise error
-    return value

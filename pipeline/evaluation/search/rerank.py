@@ -22,11 +22,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pipeline import distributed
-from pipeline.common.errors import DataError, UsageError
+from pipeline.common.errors import UsageError
 from pipeline.common.progress import Progress
 from pipeline.config import EvaluationConfig
 from pipeline.data.images import load_image, normalise, to_input
-from pipeline.evaluation.describe.encode import raise_together
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 PROPOSALS = 256  # pairs of matches tried; all pairs where there are fewer
@@ -144,19 +143,18 @@ def rerank(
         raise UsageError(f"rerank {first} needs as many candidates, the search gave {predictions.shape[1]}")
     own = distributed.rank_slice(len(predictions))
     scores = np.full((own.stop - own.start, first), -1, np.int64)
-    problem = ""
     label, show = f"re-ranking {evaluated.name}", progress and distributed.rank() == 0
-    with Progress(label, len(scores), "queries of this rank", enabled=show) as bar:
-        try:
+
+    def compare() -> None:
+        with Progress(label, len(scores), "queries of this rank", enabled=show) as bar:
             for i, q in enumerate(range(own.start, own.stop)):
                 query = tokens.of(evaluated.queries[q])
                 for j, row in enumerate(predictions[q, :first].tolist()):
                     if row >= 0:
                         scores[i, j] = score(query, tokens.of(evaluated.database[row]), (q, row))
                 bar.advance()
-        except (DataError, OSError) as error:
-            problem = str(error)
-    raise_together(problem, tokens.device)
+
+    distributed.agreed(compare, what=label)
     all_scores = distributed.gather_uneven(torch.from_numpy(scores).to(tokens.device)).cpu().numpy()
     order = np.argsort(-all_scores, axis=1, kind="stable")
     rows, kept = predictions.copy(), distances.copy()
