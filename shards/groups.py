@@ -23,14 +23,14 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from pipeline.common.files import sync_path, write_atomically
-from shards import index
+from shards import schema
 from shards.catalogue import Catalogue, LeftOut, runs
 from shards.images import ImageRule, Refused, admit
 from shards.rounds import IMAGES_A_PLACE, draw, permutation, rank
 from shards.shard_file import Member, ShardFile
 
 PART_SCHEMA = pa.schema(
-    [("number", pa.int64()), ("good", pa.int32()), *(f for f in index.SCHEMA if f.name != "place")]
+    [("number", pa.int64()), ("good", pa.int32()), *(f for f in schema.SCHEMA if f.name != "place")]
 )  # number: what `sample` spells; good: the place's good images
 _MEMBERS = tuple(f"{k}.jpg" for k in range(IMAGES_A_PLACE))
 _TAR_OVERHEAD = 6 * 1024  # headers, padding and JSON of a sample, about
@@ -117,14 +117,14 @@ def shard_name(round_: int, group: int) -> str:
 
 def part_path(out: Path, group: int) -> Path:
     """The file that says that a group is finished, and holds its rows of the index."""
-    return out / index.UNFINISHED / f"part-{group:05d}.parquet"
+    return out / schema.UNFINISHED / f"part-{group:05d}.parquet"
 
 
 def write_group(task: GroupTask) -> int:
     """Writes a group's shards and its part file, unless they are there and whole; returns the photos it stands for."""
     if not _is_finished(task):
         with contextlib.ExitStack() as stack:
-            folder = task.out / index.UNFINISHED
+            folder = task.out / schema.UNFINISHED
             names = [shard_name(r, task.number) for r in range(task.rounds)]
             shards = [stack.enter_context(ShardFile(folder / (name + ".tmp"))) for name in names]
             rows, facts = _write_samples(task, shards)

@@ -3,46 +3,42 @@
 `index.parquet` has one row a sample (a place in a round); `manifest.json` has every file's size and sha256, the
 settings, the counts and what was left out. Invariant: the manifest is written last and atomically, so a folder with a
 manifest is a complete shard set; every byte of the set is covered by a hash in it, and the manifest by its own.
+Both are checked whole, once, when the set is opened (`shards.schema`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
-import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from pipeline.common.errors import DataError
+from pipeline.common.errors import DataError, UsageError
 from pipeline.common.progress import track
-
-FORMAT_VERSION = 2
-_WITHOUT_POSITIONS = 1  # the format before it, without `lat` and `lon`: still read
-IMAGES_A_SAMPLE = 4
-INDEX, MANIFEST, REPORT, UNFINISHED = "index.parquet", "manifest.json", "report.csv", "unfinished"
-SCHEMA = pa.schema(
-    [
-        ("sample", pa.string()),  # "000123": prefix of the sample's members, unique in the set
-        ("round", pa.int32()),
-        ("city", pa.string()),
-        ("place_id", pa.string()),
-        ("place", pa.int32()),  # 0..P-1 in the order of (city, place_id); the same in all rounds
-        ("shard", pa.string()),  # file name
-        ("offsets", pa.list_(pa.int64(), IMAGES_A_SAMPLE)),  # byte position of each JPEG in the shard
-        ("sizes", pa.list_(pa.int64(), IMAGES_A_SAMPLE)),  # its length in bytes
-        ("json_offset", pa.int64()),
-        ("json_size", pa.int64()),
-        ("lat", pa.float64()),  # degrees: mean of the place's images, the same in all rounds; null where unknown
-        ("lon", pa.float64()),
-    ]
+from pipeline.common.text import shown
+from shards.schema import (
+    HEADER,
+    INDEX,
+    MANIFEST,
+    REPORT,
+    SCHEMA,
+    UNFINISHED,
+    WITHOUT_POSITIONS,
+    check_index,
+    check_manifest,
+    sha256,
 )
+
+_LARGEST = {MANIFEST: 1 << 28, INDEX: 1 << 32, REPORT: 1 << 34}  # bytes read into memory
 _BLOCK = 1 << 22
 
 
@@ -75,7 +71,7 @@ class ShardIndex:
         Raises:
             DataError: the set was made before the index had positions.
         """
-        if self.manifest["format_version"] == _WITHOUT_POSITIONS:
+        if self.manifest["format_version"] == WITHOUT_POSITIONS:
             raise DataError(
                 f"{self.root}/{INDEX} was written without positions (lat, lon) by an earlier version: "
                 f"prepare the shards again with --overwrite"
@@ -86,10 +82,12 @@ class ShardIndex:
 
 
 def read_index(root: str) -> ShardIndex:
-    """Opens a shard set at a folder or any fsspec URL; reads index and manifest only, checks both by hash.
+    """Opens a shard set at a folder or any fsspec URL; reads index and manifest only, and checks both completely.
 
     Raises:
-        DataError: no shard set there, an unfinished one, another format, or an index or manifest that was changed.
+        DataError: no shard set there, an unfinished one, another format, or an index or manifest that was changed or
+            that contradicts itself.
+        UsageError: a URL whose file system is unknown or not installed.
     """
     files = _Files(root)
     try:
@@ -97,24 +95,25 @@ def read_index(root: str) -> ShardIndex:
     except FileNotFoundError:
         hint = "unfinished: run the same jobs.prepare command again" if files.has(UNFINISHED) else "not a shard set"
         raise DataError(f"{root}: no {MANIFEST} there ({hint}; shard sets are made by jobs.prepare)") from None
-    manifest, problems = _read_manifest(raw)
-    if problems:
-        raise DataError(f"{root}/{problems[0]}")
     try:
         index = files.read(INDEX)
     except FileNotFoundError:
         raise DataError(f"{root}/{INDEX} is missing: prepare the shards again") from None
-    table, problems = _read_table(index, manifest)
-    if table is None or problems:
-        raise DataError(f"{root}/{problems[0]}")
-    return ShardIndex(root, table, manifest, manifest["index_sha256"])
+    try:
+        manifest = check_manifest(raw)
+        return ShardIndex(root, check_index(index, manifest), manifest, manifest["index_sha256"])
+    except DataError as error:
+        raise DataError(f"{root}/{error}") from None
 
 
 def verify(root: str) -> list[str]:
     """Reads every byte of a shard set and names what is not as its manifest says; empty when all is well.
 
     Found are: a changed, truncated, missing or extra file, down to one flipped bit anywhere, also in the index, the
-    report and the manifest itself.
+    report and the manifest itself; and an index that does not lead to the members it names.
+
+    Raises:
+        DataError, UsageError: the folder or one of its small files cannot be read at all.
     """
     files = _Files(root)
     if not files.is_folder():
@@ -123,29 +122,28 @@ def verify(root: str) -> list[str]:
     if MANIFEST not in present:
         extra = "; the set is unfinished: run the same jobs.prepare command again" if UNFINISHED in present else ""
         return [f"{MANIFEST} is missing{extra}"]
-    manifest, problems = _read_manifest(files.read(MANIFEST))
-    if problems:
-        return problems
+    try:
+        manifest = check_manifest(files.read(MANIFEST))
+    except DataError as error:
+        return [str(error)]
     listed = {shard["name"]: shard for shard in manifest["shards"]}
     expected = {MANIFEST, INDEX, REPORT, *listed}
-    problems += [f"{name} is missing" for name in sorted(expected - present)]
-    problems += [f"{name} is not part of the set" for name in sorted(present - expected)]
+    problems = [f"{name} is missing" for name in sorted(expected - present)]
+    problems += [f"{shown(name)} is not part of the set" for name in sorted(present - expected)]
+    table = None
     if INDEX in present:
-        problems += _read_table(files.read(INDEX), manifest)[1]
+        try:
+            table = check_index(files.read(INDEX), manifest)
+        except DataError as error:
+            problems.append(str(error))
     if REPORT in present and sha256(files.read(REPORT)) != manifest["report_sha256"]:
         problems.append(f"{REPORT} has changed: its sha256 is not the manifest's")
-    check = partial(_check_shard, files)
+    check = partial(_check_shard, files, table)
     with ThreadPoolExecutor() as pool:  # hashing and reading release the interpreter lock
         shards = [listed[name] for name in sorted(listed) if name in present]
         for problem in track(pool.map(check, shards), "verifying", len(shards), "shards"):
             problems += [problem] if problem else []
     return problems
-
-
-def sealed_manifest(manifest: dict[str, Any]) -> bytes:
-    """The bytes of manifest.json: canonical JSON with the sha256 of all the rest inside."""
-    rest = {key: value for key, value in manifest.items() if key != "manifest_sha256"}
-    return canonical({**rest, "manifest_sha256": sha256(canonical(rest))})
 
 
 def index_bytes(table: pa.Table) -> bytes:
@@ -155,85 +153,103 @@ def index_bytes(table: pa.Table) -> bytes:
     return sink.getvalue()
 
 
-def canonical(value: Any) -> bytes:
-    """JSON with sorted keys: equal values give equal bytes."""
-    return (json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False) + "\n").encode()
-
-
-def sha256(data: bytes) -> str:
-    """Hex digest."""
-    return hashlib.sha256(data).hexdigest()
-
-
 class _Files:
-    """The files of one folder, local or at any fsspec URL."""
+    """The files of one folder, local or at any fsspec URL. What it cannot read is a `DataError`, what is not there a
+    `FileNotFoundError`."""
 
     def __init__(self, root: str) -> None:
         from fsspec.core import url_to_fs
 
-        self.fs, self.path = url_to_fs(str(root))
+        self.root = root
+        try:
+            self.fs, self.path = url_to_fs(str(root))
+        except (ImportError, ValueError, OSError) as error:  # the package of a file system; an unknown one
+            raise UsageError(f"{shown(root)}: cannot be opened ({_line(error)})") from None
 
     def _at(self, name: str) -> str:
         return f"{self.path.rstrip('/')}/{name}"
 
+    @contextmanager
+    def _told(self, name: str) -> Iterator[None]:
+        try:
+            yield
+        except (FileNotFoundError, DataError):
+            raise
+        except Exception as error:  # each file system has errors of its own
+            raise DataError(f"{shown(self.root)}/{name} cannot be read ({_line(error)})") from None
+
     def is_folder(self) -> bool:
-        return bool(self.fs.isdir(self.path))
+        with self._told(""):
+            return bool(self.fs.isdir(self.path))
 
     def has(self, name: str) -> bool:
-        return bool(self.fs.exists(self._at(name)))
+        with self._told(name):
+            return bool(self.fs.exists(self._at(name)))
 
     def names(self) -> set[str]:
-        return {entry.rstrip("/").rsplit("/", 1)[-1] for entry in self.fs.ls(self.path, detail=False)}
+        with self._told(""):
+            return {entry.rstrip("/").rsplit("/", 1)[-1] for entry in self.fs.ls(self.path, detail=False)}
 
     def read(self, name: str) -> bytes:
-        return bytes(self.fs.cat_file(self._at(name)))
+        with self._told(name):
+            if self._size(name) > _LARGEST[name]:
+                raise DataError(f"{self.root}/{name} has {self._size(name):,} bytes, which no real one has")
+            return bytes(self.fs.cat_file(self._at(name)))
 
     def blocks(self, name: str) -> Iterator[bytes]:
-        with self.fs.open(self._at(name), "rb") as stream:
-            while block := stream.read(_BLOCK):
-                yield block
+        with self._told(name):
+            self._size(name)
+            with self.fs.open(self._at(name), "rb") as stream:
+                while block := stream.read(_BLOCK):
+                    while len(block) < _BLOCK and (more := stream.read(_BLOCK - len(block))):
+                        block += more  # a connection gives what it has: whole tar blocks are wanted
+                    yield block
+
+    def _size(self, name: str) -> int:
+        """Bytes of a file, 0 where the file system does not say. Refuses what is no file: reading a pipe never ends."""
+        told = self.fs.info(self._at(name))
+        if told.get("type") != "file":
+            raise DataError(f"{self.root}/{name} is not an ordinary file ({shown(told.get('type'))})")
+        return int(told.get("size") or 0)
 
 
-def _check_shard(files: _Files, shard: dict[str, Any]) -> str | None:
-    digest, size = hashlib.sha256(), 0
+def _line(error: Exception) -> str:
+    return shown(f"{type(error).__name__}: {error}".splitlines()[0])
+
+
+def _check_shard(files: _Files, table: pa.Table | None, shard: dict[str, Any]) -> str | None:
+    digest, size, problem = hashlib.sha256(), 0, None
+    headers = _headers(table, shard["name"]) if table is not None else {}
+    expected = sorted(headers, reverse=True)
     try:
         for block in files.blocks(shard["name"]):
             digest.update(block)
+            while expected and expected[-1] < size + len(block):
+                at = expected.pop()
+                found = block[at - size : at - size + HEADER]
+                if (found[:100].rstrip(b"\0"), found[124:135]) != headers[at]:
+                    name, long = headers[at][0].decode(), int(headers[at][1], 8)
+                    problem = problem or f"{INDEX} leads to {name} ({long:,} bytes), which is not there"
             size += len(block)
-    except OSError as error:
-        return f"{shard['name']} cannot be read: {error}"
+    except FileNotFoundError:
+        return f"{shard['name']} is missing"
+    except DataError as error:
+        return str(error)
     if size != shard["bytes"]:
         return f"{shard['name']} has {size:,} bytes, the manifest says {shard['bytes']:,}"
     if digest.hexdigest() != shard["sha256"]:
         return f"{shard['name']} has changed: its sha256 is not the manifest's"
-    return None
+    return f"{shard['name']}: {problem}" if problem else None
 
 
-def _read_manifest(raw: bytes) -> tuple[dict[str, Any], list[str]]:
-    try:
-        manifest = json.loads(raw)
-    except ValueError as error:
-        return {}, [f"{MANIFEST} is not valid JSON: {error}"]
-    version = manifest.get("format_version") if isinstance(manifest, dict) else None
-    if not isinstance(manifest, dict) or raw != sealed_manifest(manifest):
-        return {}, [f"{MANIFEST} has changed: it does not agree with the sha256 inside it"]
-    if version not in (_WITHOUT_POSITIONS, FORMAT_VERSION):
-        return {}, [f"{MANIFEST} has format version {version}, this program reads {FORMAT_VERSION}: prepare again"]
-    return manifest, []
-
-
-def _read_table(raw: bytes, manifest: dict[str, Any]) -> tuple[pa.Table | None, list[str]]:
-    if sha256(raw) != manifest["index_sha256"]:
-        return None, [f"{INDEX} has changed: its sha256 is not the manifest's"]
-    try:
-        table = pq.read_table(io.BytesIO(raw))
-    except (pa.ArrowInvalid, OSError) as error:
-        return None, [f"{INDEX} cannot be read: {error}"]
-    if manifest["format_version"] == _WITHOUT_POSITIONS:
-        for name in ("lat", "lon"):
-            table = table.append_column(name, pa.nulls(table.num_rows, pa.float64()))
-    if table.schema.names != SCHEMA.names:
-        return None, [f"{INDEX} has columns {table.schema.names}, expected {SCHEMA.names}"]
-    if table.num_rows != manifest["counts"]["samples"]:
-        return None, [f"{INDEX} has {table.num_rows:,} rows, the manifest says {manifest['counts']['samples']:,}"]
-    return table.cast(SCHEMA), []
+def _headers(table: pa.Table, shard: str) -> dict[int, tuple[bytes, bytes]]:
+    """Name and size, as a tar header spells them, by the header's position, of each member that the index names."""
+    mine = table.filter(pc.equal(table["shard"], shard))
+    headers = {}
+    for sample, offsets, sizes, json_offset, json_size in zip(
+        *(mine[name].to_pylist() for name in ("sample", "offsets", "sizes", "json_offset", "json_size")), strict=True
+    ):
+        names = (*(f"{sample}.{k}.jpg" for k in range(len(offsets))), f"{sample}.json")
+        for name, offset, size in zip(names, (*offsets, json_offset), (*sizes, json_size), strict=True):
+            headers[offset - HEADER] = (name.encode(), b"%011o" % size)
+    return headers

@@ -29,13 +29,12 @@ import pyarrow.compute as pc
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import write_atomically
 from pipeline.common.progress import Progress
-from shards import groups, index, report
+from shards import groups, index, report, schema
 from shards.catalogue import Catalogue, LeftOut
 from shards.images import QUALITY, ImageRule
 from shards.rounds import IMAGES_A_PLACE, shown
 
 SETTINGS = "settings.json"
-MAX_ROUNDS = 128  # as many files are open at once in each worker
 _BYTES_A_WORKER = 64_000_000  # photos worth a second of starting a process
 
 
@@ -96,7 +95,7 @@ def write_shards(catalogue: Catalogue, out: Path, rule: WriteRule | None = None)
                 for images in _write_groups(plan, out, rule):
                     progress.advance(images)
             counts, left_out = _complete(catalogue, plan, out, rule, settings)
-        shutil.rmtree(out / index.UNFINISHED)
+        shutil.rmtree(out / schema.UNFINISHED)
     except OSError as error:
         raise UsageError(f"{out}: {error}; finished shards are kept, the same command continues") from error
     return report.Summary(str(out), counts, report.reasons(left_out), time.monotonic() - start, plan.images)
@@ -105,8 +104,8 @@ def write_shards(catalogue: Catalogue, out: Path, rule: WriteRule | None = None)
 def remove_shards(out: Path) -> None:
     """Deletes the files of a shard set, finished or not, and nothing else; the manifest first."""
     if out.is_dir():
-        for path in sorted(out.iterdir(), key=lambda p: (p.name != index.MANIFEST, p.name)):
-            if path.name == index.UNFINISHED:
+        for path in sorted(out.iterdir(), key=lambda p: (p.name != schema.MANIFEST, p.name)):
+            if path.name == schema.UNFINISHED:
                 shutil.rmtree(path)
             elif _is_ours(path.name):
                 path.unlink()
@@ -114,8 +113,8 @@ def remove_shards(out: Path) -> None:
 
 def _completed(rule: WriteRule, catalogue: Catalogue) -> WriteRule:
     """The rule with defaults filled in, or a refusal."""
-    if not 1 <= rule.rounds <= MAX_ROUNDS:
-        raise UsageError(f"--rounds {rule.rounds}: give 1 to {MAX_ROUNDS}")
+    if not 1 <= rule.rounds <= schema.MAX_ROUNDS:
+        raise UsageError(f"--rounds {rule.rounds}: give 1 to {schema.MAX_ROUNDS}")
     if not 0 <= rule.max_bad <= 1:
         raise UsageError(f"--max-bad {rule.max_bad}: a share between 0 and 1")
     if rule.shard_mb <= 0 or rule.workers < 0 or rule.image.resize < 0:
@@ -133,15 +132,15 @@ def _already(out: Path, settings: dict[str, Any]) -> report.Summary | None:
     names = {path.name for path in out.iterdir()}
     if foreign := sorted(name for name in names if not _is_ours(name)):
         raise UsageError(f"--out {out}: holds other files ({foreign[0]}); give an empty folder or a new name")
-    earlier = out / index.UNFINISHED / SETTINGS
-    if index.MANIFEST in names:
+    earlier = out / schema.UNFINISHED / SETTINGS
+    if schema.MANIFEST in names:
         found = index.read_index(str(out)).manifest
         _compare(out, found["settings"], settings)
         problem = next((s["name"] for s in found["shards"] if _size(out / s["name"]) != s["bytes"]), None)
         if problem:
             raise DataError(f"{out}/{problem}: missing or truncated; start with --overwrite to write the set again")
-        if index.UNFINISHED in names:  # killed between the manifest and the tidying
-            shutil.rmtree(out / index.UNFINISHED)
+        if schema.UNFINISHED in names:  # killed between the manifest and the tidying
+            shutil.rmtree(out / schema.UNFINISHED)
         return report.Summary(str(out), found["counts"], found["left_out"], 0.0, 0)
     if earlier.exists():
         _compare(out, json.loads(earlier.read_bytes()), settings)
@@ -169,7 +168,7 @@ def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _is_ours(name: str) -> bool:
-    ours = (index.MANIFEST, index.INDEX, index.REPORT, index.UNFINISHED)
+    ours = (schema.MANIFEST, schema.INDEX, schema.REPORT, schema.UNFINISHED)
     return name in ours or re.fullmatch(r"round-\d{2,}-\d{5,}\.tar", name) is not None
 
 
@@ -187,7 +186,7 @@ def _check_space(out: Path, plan: groups.GroupPlan, rule: WriteRule) -> None:
 @contextlib.contextmanager
 def _begun(out: Path, settings: dict[str, Any]) -> Iterator[None]:
     """The folder of unfinished work: locked against a second run, its settings written, old temporary files gone."""
-    folder = out / index.UNFINISHED
+    folder = out / schema.UNFINISHED
     folder.mkdir(exist_ok=True)
     with (folder / "lock").open("w") as lock:
         try:
@@ -197,7 +196,7 @@ def _begun(out: Path, settings: dict[str, Any]) -> Iterator[None]:
         for stale in folder.glob("*.tmp"):
             stale.unlink(missing_ok=True)
         if not (folder / SETTINGS).exists():
-            write_atomically(folder / SETTINGS, index.canonical(settings))
+            write_atomically(folder / SETTINGS, schema.canonical(settings))
         yield
 
 
@@ -257,8 +256,8 @@ def _complete(
     rows = pa.concat_tables([table for table, _ in parts]).sort_by([("round", "ascending"), ("number", "ascending")])
     places = groups.places_of(rows)
     if not places.num_rows:
-        write_atomically(out / index.REPORT, report.report_bytes(left_out))
-        raise DataError(f"{out}/{index.REPORT}: no place has {IMAGES_A_PLACE} good images; it says what is wrong")
+        write_atomically(out / schema.REPORT, report.report_bytes(left_out))
+        raise DataError(f"{out}/{schema.REPORT}: no place has {IMAGES_A_PLACE} good images; it says what is wrong")
     under = catalogue.listed.filter(pc.less(catalogue.listed["images"], IMAGES_A_PLACE)).to_pylist()
     fallen = [*_fallen_at_sight(catalogue, plan), *(tuple(item) for fact in facts for item in fact["fallen"])]
     shards = sorted((shard for fact in facts for shard in fact["shards"]), key=lambda shard: shard["name"])
@@ -274,12 +273,16 @@ def _complete(
     told = report.report_bytes([*left_out, *report.place_lines(under, fallen)])
     data = index.index_bytes(_with_place(rows, places))
     manifest = {
-        "format_version": index.FORMAT_VERSION, "settings": settings, "counts": counts,
+        "format_version": schema.FORMAT_VERSION, "settings": settings, "counts": counts,
         "left_out": report.reasons(left_out), "shards": shards,
-        "index_sha256": index.sha256(data), "report_sha256": index.sha256(told),
+        "index_sha256": schema.sha256(data), "report_sha256": schema.sha256(told),
     }  # fmt: skip
-    work = out / index.UNFINISHED
-    for name, content in ((index.REPORT, told), (index.INDEX, data), (index.MANIFEST, index.sealed_manifest(manifest))):
+    work = out / schema.UNFINISHED
+    for name, content in (
+        (schema.REPORT, told),
+        (schema.INDEX, data),
+        (schema.MANIFEST, schema.sealed_manifest(manifest)),
+    ):
         write_atomically(out / name, content, work / (name + ".tmp"))
     return counts, left_out
 
@@ -289,7 +292,7 @@ def _with_place(rows: pa.Table, places: pa.Table) -> pa.Table:
                       places["place"].to_pylist(), strict=True))  # fmt: skip
     keys = zip(rows["city"].to_pylist(), rows["place_id"].to_pylist(), strict=True)
     rows = rows.append_column("place", pa.array([number[key] for key in keys], pa.int32()))
-    return rows.select(index.SCHEMA.names)
+    return rows.select(schema.SCHEMA.names)
 
 
 def _fallen_at_sight(catalogue: Catalogue, plan: groups.GroupPlan) -> list[tuple[str, str, int, int]]:
@@ -306,11 +309,11 @@ def _fallen_at_sight(catalogue: Catalogue, plan: groups.GroupPlan) -> list[tuple
 def _refuse(out: Path, catalogue: Catalogue, left_out: list[LeftOut], max_bad: float, began: bool) -> None:
     """Names the bad images in report.csv and ends the run without a manifest."""
     out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / index.REPORT, report.report_bytes(left_out))
+    write_atomically(out / schema.REPORT, report.report_bytes(left_out))
     n, of = len(left_out), catalogue.images
     why = ", ".join(f"{count:,} {reason}" for reason, count in report.reasons(left_out).items())
     kept = "; a higher --max-bad continues with the shards written, mended files need --overwrite" if began else ""
     raise DataError(
-        f"{out}/{index.REPORT}: {n:,} of {of:,} images cannot be used ({why}), {100 * n / of:.2f} % and over "
+        f"{out}/{schema.REPORT}: {n:,} of {of:,} images cannot be used ({why}), {100 * n / of:.2f} % and over "
         f"--max-bad {max_bad:g}; mend them or raise --max-bad{kept}"
     )

@@ -12,7 +12,7 @@ import fsspec
 import pytest
 
 from pipeline.common.errors import DataError
-from shards import index
+from shards import index, schema
 from shards.sources.registry import read_source
 from shards.writer import WriteRule, write_shards
 
@@ -34,7 +34,7 @@ def test_a_whole_set_has_no_problems(shard_set: Path) -> None:
     assert index.verify(str(shard_set)) == []
 
 
-@pytest.mark.parametrize("pattern", ["round-*.tar", index.INDEX, index.MANIFEST, index.REPORT])
+@pytest.mark.parametrize("pattern", ["round-*.tar", schema.INDEX, schema.MANIFEST, schema.REPORT])
 def test_one_flipped_bit_anywhere_is_found(pattern: str, shard_set: Path) -> None:
     """Twenty bits spread over each kind of file, the first and the last among them, one at a time."""
     path = sorted(shard_set.glob(pattern))[-1]
@@ -74,7 +74,7 @@ def test_exchanged_shards_are_found(shard_set: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [(index.MANIFEST, "no manifest.json there .not a shard set"), (index.INDEX, "index.parquet is missing")],
+    [(schema.MANIFEST, "no manifest.json there .not a shard set"), (schema.INDEX, "index.parquet is missing")],
 )
 def test_an_incomplete_set_is_not_opened(name: str, message: str, shard_set: Path) -> None:
     (shard_set / name).unlink()
@@ -84,23 +84,23 @@ def test_an_incomplete_set_is_not_opened(name: str, message: str, shard_set: Pat
 
 
 def test_a_changed_index_is_not_opened(shard_set: Path) -> None:
-    flip(shard_set / index.INDEX, 999)
+    flip(shard_set / schema.INDEX, 999)
     with pytest.raises(DataError, match=r"index\.parquet has changed"):
         index.read_index(str(shard_set))
 
 
 def test_an_edited_manifest_is_not_opened(shard_set: Path) -> None:
-    path = shard_set / index.MANIFEST
+    path = shard_set / schema.MANIFEST
     manifest = json.loads(path.read_bytes())
     manifest["counts"]["places"] += 1
-    path.write_bytes(index.canonical(manifest))
+    path.write_bytes(schema.canonical(manifest))
     with pytest.raises(DataError, match=r"manifest\.json has changed"):
         index.read_index(str(shard_set))
 
 
 def test_another_format_version_is_told(shard_set: Path) -> None:
-    path = shard_set / index.MANIFEST
-    path.write_bytes(index.sealed_manifest({**json.loads(path.read_bytes()), "format_version": 99}))
+    path = shard_set / schema.MANIFEST
+    path.write_bytes(schema.sealed_manifest({**json.loads(path.read_bytes()), "format_version": 99}))
     with pytest.raises(DataError, match="format version 99"):
         index.read_index(str(shard_set))
 
@@ -110,7 +110,7 @@ def test_no_folder_and_nonsense_are_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="not a shard set"):
         index.read_index(str(tmp_path / "nowhere"))
     for nonsense in (b"", b"[]", b"null", b"{", b"\xff\xfe"):
-        (tmp_path / index.MANIFEST).write_bytes(nonsense)
+        (tmp_path / schema.MANIFEST).write_bytes(nonsense)
         assert index.verify(str(tmp_path))
         with pytest.raises(DataError):
             index.read_index(str(tmp_path))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shards import index
+from shards import index, schema
 from shards.sources.gsv_cities import _read_frame
 
 PLACES = 57_462  # with at least four images, of 59,342
@@ -49,7 +49,7 @@ def test_all_places_of_gsv_cities(shared_dir: Path, tmp_path: Path, photo: Calla
     print(f"\n{told}\nwhole job {seconds:.1f} s, largest process {int(largest) / 1e3:.0f} MB")
     started = time.monotonic()
     opened = index.read_index(str(out))
-    print(f"read_index: {time.monotonic() - started:.2f} s, {(out / index.INDEX).stat().st_size / 1e6:.1f} MB on disk")
+    print(f"read_index: {time.monotonic() - started:.2f} s, {(out / schema.INDEX).stat().st_size / 1e6:.1f} MB on disk")
     counts = opened.manifest["counts"]
     assert opened.table.num_rows == 2 * PLACES
     assert counts["places"] == PLACES and counts["places_under_four"] == 59_342 - PLACES

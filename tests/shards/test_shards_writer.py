@@ -17,7 +17,7 @@ import pytest
 import webdataset
 
 from pipeline.common.errors import DataError, UsageError
-from shards import groups, index
+from shards import groups, index, schema
 from shards.images import ImageRule
 from shards.report import Summary
 from shards.sources.registry import read_source
@@ -88,7 +88,7 @@ def test_the_index_points_at_the_bytes(written: tuple[Path, Path, Summary]) -> N
     source, out, _ = written
     opened = index.read_index(str(out))
     table = opened.table
-    assert table.schema.equals(index.SCHEMA)
+    assert table.schema.equals(schema.SCHEMA)
     tars = {path.name: path.read_bytes() for path in out.glob("*.tar")}
     by_key = {sample["__key__"]: sample for sample in samples(out)}
     assert len(by_key) == table.num_rows == len(set(table["sample"].to_pylist()))
@@ -148,11 +148,11 @@ def test_a_set_made_before_the_index_had_positions_is_read(written: tuple[Path, 
     now = index.read_index(str(out))
     sink = io.BytesIO()
     pq.write_table(now.table.drop_columns(["lat", "lon"]), sink)
-    manifest = {**now.manifest, "format_version": 1, "index_sha256": index.sha256(sink.getvalue())}
-    (out / index.INDEX).write_bytes(sink.getvalue())
-    (out / index.MANIFEST).write_bytes(index.sealed_manifest(manifest))
+    manifest = {**now.manifest, "format_version": 1, "index_sha256": schema.sha256(sink.getvalue())}
+    (out / schema.INDEX).write_bytes(sink.getvalue())
+    (out / schema.MANIFEST).write_bytes(schema.sealed_manifest(manifest))
     old = index.read_index(str(out))
-    assert old.table.schema.equals(index.SCHEMA) and index.verify(str(out)) == []
+    assert old.table.schema.equals(schema.SCHEMA) and index.verify(str(out)) == []
     assert old.table.drop_columns(["lat", "lon"]).equals(now.table.drop_columns(["lat", "lon"]))
     with pytest.raises(DataError, match=r"without positions .* --overwrite"):
         old.positions()
@@ -169,7 +169,7 @@ def test_nothing_disappears_from_the_counts(written: tuple[Path, Path, Summary])
     assert (c["places"], c["places_under_four"], c["places_fallen"], c["samples"]) == (7, 3, 0, 21)
     assert c["bytes"] == sum(path.stat().st_size for path in out.glob("*.tar"))
     assert dict(summary.counts) == c and "under four images" in str(summary)
-    told = (out / index.REPORT).read_text().splitlines()
+    told = (out / schema.REPORT).read_text().splitlines()
     assert ",PRS,200009,only 3 images are named" in told and len(told) == 1 + 3
 
 
@@ -217,7 +217,7 @@ def test_bad_images_are_named_and_left_out(gsv: Gsv, tmp_path: Path) -> None:
     tiny.write_bytes(tiny.read_bytes()[:-40])
     broken[f"Images/OSL/{tiny.name}"] = "broken JPEG"
     summary = write_shards(read_source(source), out, WriteRule(rounds=10, max_bad=0.1, workers=1))
-    with (out / index.REPORT).open() as stream:
+    with (out / schema.REPORT).open() as stream:
         told = list(csv.DictReader(stream))
     named = {row["file"].replace(".JPG", ".jpg"): row["reason"] for row in told if row["file"]}
     assert named.keys() == {name.replace(".JPG", ".jpg") for name in broken}
@@ -241,8 +241,8 @@ def test_too_many_bad_images_end_the_run_without_a_manifest(gsv: Gsv, tmp_path: 
     rule = WriteRule(rounds=1, max_bad=0.05, workers=1)
     with pytest.raises(DataError, match=r"report.csv: 5 of 79 images .* 6\.33 % and over --max-bad 0\.05"):
         write_shards(read_source(source), out, rule)
-    assert not (out / index.MANIFEST).exists() and not (out / index.INDEX).exists()
-    assert len((out / index.REPORT).read_text().splitlines()) == 6
+    assert not (out / schema.MANIFEST).exists() and not (out / schema.INDEX).exists()
+    assert len((out / schema.REPORT).read_text().splitlines()) == 6
     with pytest.raises(DataError, match="unfinished"):
         index.read_index(str(out))
     summary = write_shards(read_source(source), out, WriteRule(rounds=1, max_bad=0.07, workers=1))  # goes on
@@ -256,7 +256,7 @@ def test_too_many_missing_images_are_told_before_any_work(gsv: Gsv, tmp_path: Pa
     gone.unlink()
     with pytest.raises(DataError, match="1 missing"):
         write_shards(read_source(source), out, WriteRule(workers=1))
-    assert [path.name for path in out.iterdir()] == [index.REPORT]
+    assert [path.name for path in out.iterdir()] == [schema.REPORT]
     gone.write_bytes(data)  # mended: the same folder can be used
     assert write_shards(read_source(source), out, WriteRule(workers=1)).counts["images_bad"] == 0
 
@@ -333,7 +333,7 @@ def test_finished_groups_are_kept_only_while_their_shards_are_whole(
     with pytest.raises(UsageError, match=r"No space left.*same command"):
         write_shards(read_source(source), out, rule)
     monkeypatch.undo()
-    assert len(list(out.glob("round-00-*.tar"))) == 3 and not (out / index.MANIFEST).exists()
+    assert len(list(out.glob("round-00-*.tar"))) == 3 and not (out / schema.MANIFEST).exists()
     kept, rotten = out / groups.shard_name(1, 0), out / groups.shard_name(1, 1)
     kept_at = kept.stat().st_mtime_ns
     data = bytearray(rotten.read_bytes())
@@ -362,8 +362,8 @@ def test_two_runs_at_once_are_refused(gsv: Gsv, tmp_path: Path) -> None:
     import fcntl
 
     out = tmp_path / "out"
-    (out / index.UNFINISHED).mkdir(parents=True)
-    with (out / index.UNFINISHED / "lock").open("w") as lock:
+    (out / schema.UNFINISHED).mkdir(parents=True)
+    with (out / schema.UNFINISHED / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(UsageError, match="another run"):
             write_shards(read_source(gsv({"PRS": [4]})), out, WriteRule(workers=1))

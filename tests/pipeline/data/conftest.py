@@ -13,7 +13,8 @@ import pyarrow as pa
 import pytest
 from PIL import Image
 
-from shards.index import FORMAT_VERSION, SCHEMA, ShardIndex
+from shards.index import ShardIndex
+from shards.schema import FORMAT_VERSION, SCHEMA
 
 Build = Callable[..., ShardIndex]
 

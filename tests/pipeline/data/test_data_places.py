@@ -169,7 +169,8 @@ from types import SimpleNamespace
 import pyarrow as pa
 from pipeline.config import DataConfig
 from pipeline.data.places import build_loader
-from shards.index import SCHEMA, ShardIndex
+from shards.index import ShardIndex
+from shards.schema import SCHEMA
 
 def main():
     root, rows, manifest = json.loads(sys.stdin.readline())
