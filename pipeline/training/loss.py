@@ -96,8 +96,8 @@ class MultiSimilarityLoss(nn.Module):
         different = ~same & ~self._near(labels, everyone)
         positive, negative = self.mine(similarity.detach(), same & ~itself, different)
 
-        push = self._soft_sum(-self.alpha * (similarity - self.base), positive) / self.alpha
-        pull = self._soft_sum(self.beta * (similarity - self.base), negative) / self.beta
+        push = self.soft_sum(-self.alpha * (similarity - self.base), positive) / self.alpha
+        pull = self.soft_sum(self.beta * (similarity - self.base), negative) / self.beta
         local = (push + pull).mean()
 
         counts = torch.stack([(positive.any(1) | negative.any(1)).sum(), positive.sum(), negative.sum()])
@@ -141,7 +141,7 @@ class MultiSimilarityLoss(nn.Module):
         return MiningStatistics(anchors / total, positives / total, negatives / total)
 
     @staticmethod
-    def _soft_sum(exponent: Tensor, mask: Tensor) -> Tensor:
+    def soft_sum(exponent: Tensor, mask: Tensor) -> Tensor:
         """log(1 + sum over the mask of e^exponent) for each row, without overflow: [b, B] -> [b]."""
         exponent = exponent.masked_fill(~mask, -torch.inf)
         return torch.logsumexp(torch.cat([exponent.new_zeros(len(exponent), 1), exponent], dim=1), dim=1)

@@ -12,9 +12,9 @@ from processes import run_ranks
 from torch.nn.parallel import DistributedDataParallel
 
 from pipeline import distributed
+from pipeline.benchmark.cost import ROUNDS, StepSizes, collectives, engine_wire, forward_flops, step_sizes, table
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig
 from pipeline.model.vpr import build_model
-from pipeline.training.cost import ROUNDS, StepSizes, collectives, engine_wire, forward_flops, step_sizes, table
 from pipeline.training.loss import MultiSimilarityLoss
 
 SMALL = ModelConfig(
