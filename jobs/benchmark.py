@@ -242,9 +242,7 @@ def cost(job: Cost) -> None:
     """Prints both tables."""
     from pipeline.benchmark import cost
 
-    parts, engines = cost.tables(
-        job.model, job.data.image_size, job.places_per_rank, job.worlds, 2 if job.bf16 else 4
-    )
+    parts, engines = cost.tables(job.model, job.data.image_size, job.places_per_rank, job.worlds, 2 if job.bf16 else 4)
     parts.print()
     print("\nMB received for parameters and gradients, float32:\n")
     engines.print()
