@@ -55,6 +55,10 @@ class ShardCache:
         """Whether shards must be fetched."""
         return self.local is None
 
+    def path(self, name: str) -> str:
+        """Where a shard lies, for a person."""
+        return f"{self.root}/{name}"
+
     def size(self, name: str) -> int:
         """Bytes of a shard by the manifest."""
         if name not in self.shards:

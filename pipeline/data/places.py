@@ -25,9 +25,11 @@ from pipeline.config import DataConfig
 from pipeline.data import workers
 from pipeline.data.augment import Draws, check, training_view
 from pipeline.data.cache import ShardCache
+from pipeline.data.cliques import Mined
 from pipeline.data.images import decode
 from pipeline.data.plan import EpochPlan, Rows, plan
 from pipeline.data.prefetch import FetchAhead
+from pipeline.data.shard_sets import ShardSetsCache, cache_of
 
 if TYPE_CHECKING:
     from shards.index import ShardIndex
@@ -88,11 +90,15 @@ class Places(Dataset[Batch | Failure]):
         found: the samples, in the order of positions.
         cache: their shards.
         data: size and augmentation.
-        seed, epoch: with sample and view, the key of all randomness.
+        seed, turns: with sample and view, the key of all randomness; a turn for each sample, or one for all (the
+            epoch, where no place comes twice in it).
     """
 
-    def __init__(self, found: Members, cache: ShardCache, data: DataConfig, seed: int, epoch: int) -> None:
-        self.found, self.cache, self.data, self.seed, self.epoch = found, cache, data, seed, epoch
+    def __init__(
+        self, found: Members, cache: ShardCache | ShardSetsCache, data: DataConfig, seed: int, turns: Rows | int
+    ) -> None:
+        self.found, self.cache, self.data, self.seed = found, cache, data, seed
+        self.turns = np.broadcast_to(turns, len(found.samples))
         self._open: OrderedDict[str, int] = OrderedDict()
 
     def __len__(self) -> int:
@@ -120,12 +126,12 @@ class Places(Dataset[Batch | Failure]):
                 try:
                     pixels = decode(encoded)
                 except DataError as error:
-                    shard = self.found.shards[position]
+                    shard, name = self.found.shards[position], sample.rpartition("/")[2]
                     raise DataError(
-                        f"{self.cache.root}/{shard}: member {sample}.{view}.jpg of sample {sample} {error}; "
+                        f"{self.cache.path(shard)}: member {name}.{view}.jpg of sample {name} {error}; "
                         f"run jobs.prepare --verify on the shards"
                     ) from None
-                draws = Draws("view", self.seed, self.epoch, sample, view)
+                draws = Draws("view", self.seed, int(self.turns[position]), sample, view)
                 augmented = training_view(
                     pixels, size, self.data.augment, self.data.rand_ops, self.data.rand_magnitude, draws
                 )
@@ -143,10 +149,10 @@ class Places(Dataset[Batch | Failure]):
         try:
             block = os.pread(self._descriptor(shard), end - first, first)
         except OSError as error:
-            raise DataError(f"{self.cache.root}/{shard}: cannot be read at byte {first} ({error.strerror})") from None
+            raise DataError(f"{self.cache.path(shard)}: cannot be read at byte {first} ({error.strerror})") from None
         if len(block) != end - first:
             raise DataError(
-                f"{self.cache.root}/{shard}: ends before sample {self.found.samples[position]}; "
+                f"{self.cache.path(shard)}: ends before sample {self.found.samples[position]}; "
                 f"run jobs.prepare --verify on the shards"
             )
         return [block[start - first : start - first + n] for start, n in zip(starts, sizes, strict=True)]
@@ -169,7 +175,15 @@ class PlaceLoader:
     """The rest of an epoch, as this rank's batches in the order of the plan. Iterate once; `len` is what is to come."""
 
     def __init__(
-        self, index: ShardIndex, data: DataConfig, seed: int, epoch: int, start_step: int, rank: int, world_size: int
+        self,
+        index: ShardIndex,
+        data: DataConfig,
+        seed: int,
+        epoch: int,
+        start_step: int,
+        rank: int,
+        world_size: int,
+        mined: Mined | None = None,
     ) -> None:
         check(data.rand_ops, data.rand_magnitude)
         if data.places_per_batch % world_size:
@@ -177,15 +191,16 @@ class PlaceLoader:
                 f"data.places_per_batch is {data.places_per_batch}, not a multiple of the {world_size} processes: "
                 f"ranks hold equal parts of a batch"
             )
-        self.plan: EpochPlan = plan(index, seed, epoch, data.places_per_batch, data.order, data.window_shards)
+        self.plan: EpochPlan = plan(index, seed, epoch, data.places_per_batch, data.order, data.window_shards, mined)
         steps = len(self.plan.batches)
         if not 0 <= start_step <= steps:
             raise UsageError(f"epoch {epoch} has {steps} steps; it cannot start at step {start_step}")
         self.start_step, self.workers = start_step, data.workers
         self.places = data.places_per_batch // world_size
         mine = self.plan.batches[:, rank * self.places : (rank + 1) * self.places]
-        self.cache = ShardCache(index, Path(data.cache), int(data.cache_gb * 1e9))
-        self.dataset = Places(members(index, mine.reshape(-1)), self.cache, data, seed, epoch)
+        self.cache = cache_of(index, Path(data.cache), int(data.cache_gb * 1e9))
+        turns = np.repeat(self.plan.turns, self.places)
+        self.dataset = Places(members(index, mine.reshape(-1)), self.cache, data, seed, turns)
         if self.cache.remote:
             self._check_room(data)
         self._loader: DataLoader[Batch | Failure] = DataLoader(
@@ -260,12 +275,19 @@ def _as_is(batch: Any) -> Any:  # Places gives whole batches: there is nothing t
 
 
 def build_loader(
-    index: ShardIndex, data: DataConfig, seed: int, epoch: int, start_step: int, rank: int, world_size: int
+    index: ShardIndex,
+    data: DataConfig,
+    seed: int,
+    epoch: int,
+    start_step: int,
+    rank: int,
+    world_size: int,
+    mined: Mined | None = None,
 ) -> PlaceLoader:
-    """This rank's batches of an epoch from `start_step` on.
+    """This rank's batches of an epoch from `start_step` on; `mined`: as for `plan`.
 
     Raises:
         UsageError: a batch that ranks cannot share equally, or too few places or too little cache for the settings.
         DataError: while iterating, a shard or member that cannot be read or decoded.
     """
-    return PlaceLoader(index, data, seed, epoch, start_step, rank, world_size)
+    return PlaceLoader(index, data, seed, epoch, start_step, rank, world_size, mined)

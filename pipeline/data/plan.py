@@ -1,16 +1,15 @@
-"""(index, seed, epoch) -> the ordered global batches of one epoch.
+"""(index, seed, epoch, mined descriptors) -> the ordered global batches of one epoch.
 
 Invariant: a pure function. Neither rank, world size nor workers enter, so the cursor of a run is one integer, the
-number of batches consumed; within an epoch every place comes at most once, and the places left out of one epoch are
-used in the next.
+number of batches consumed; within an epoch every place comes at most once (of several shard sets: once a pass), and
+the places left out of one epoch are used in the next.
 
-Stability: random keys are the raw 64-bit outputs of Philox (a stream that numpy guarantees), keyed by SHA-256 of what
-they are for, and only sorted, stably; so the plan is the same on every platform and numpy version.
+Stability: random keys (pipeline.data.keyed) are only sorted, stably; so the plan is the same on every platform and
+numpy version.
 """
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -18,12 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.common.errors import DataError, UsageError
+from pipeline.data.cliques import Mined, cliques
+from pipeline.data.keyed import Rows, random
+from pipeline.data.shard_sets import ShardSets
 
 if TYPE_CHECKING:
     from shards.index import ShardIndex
 
-Order = Literal["city", "mixed", "blocked"]
-Rows = NDArray[np.int64]
+Order = Literal["city", "mixed", "blocked", "mined"]
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,9 @@ class EpochPlan:
     batches: Rows
     """[steps, places_per_batch] row numbers of the index table, in the order they are trained on."""
     left_over: int
-    """Places that fill no batch in this epoch, always fewer than places_per_batch."""
-    round: int
-    """The round of the shard set that the epoch reads."""
+    """Places that fill no batch in a pass of this epoch, always fewer than places_per_batch."""
+    turns: Rows
+    """[steps] the turn of each batch, epoch x passes + pass: with the sample, the key of its images' randomness."""
 
     def slice(self, step: int, rank: int, world_size: int) -> Rows:
         """The rows of rank `rank` in global batch `step`: its contiguous part, [places_per_batch / world_size]."""
@@ -51,6 +52,7 @@ def plan(
     places_per_batch: int,
     order: Order,
     window_shards: int = 8,
+    mined: Mined | None = None,
 ) -> EpochPlan:
     """Orders one epoch.
 
@@ -62,6 +64,11 @@ def plan(
     - `mixed`: places shuffled over all cities.
     - `blocked`: shards in random order, shuffled within windows of `window_shards`; what is left of a window opens the
       first batch of the next. A reader needs two windows at a time.
+    - `mined`: as `city`, but each city begins with its cliques of places that look alike (pipeline.data.cliques), so
+      that its batches are made of them and only its last one is filled with other places. Without `mined` (before
+      the first mining) it is `city`.
+
+    Several shard sets (pipeline.data.shard_sets): an epoch is `passes` such orders one after the other.
 
     Raises:
         UsageError: a batch that cannot be filled, or an unknown order.
@@ -74,29 +81,68 @@ def plan(
             f"data.places_per_batch ({places_per_batch}) and data.window_shards ({window_shards}) must be at least 1, "
             f"and the epoch ({epoch}) at least 0"
         )
-    which = epoch % max(index.rounds, 1)
-    rows = np.flatnonzero(_column(index, "round") == which).astype(np.int64)
-    if len(rows) < places_per_batch:
-        raise UsageError(
-            f"data.places_per_batch is {places_per_batch}, but round {which} of {index.root} has only "
-            f"{len(rows)} places: lower it, or prepare more places"
-        )
-    places = _column(index, "place")[rows]
-    rows = rows[np.argsort(places, kind="stable")]  # by place: whatever order the shards were written in
-    if len(np.unique(places)) != len(places):
-        raise DataError(f"{index.root}: round {which} of the index holds a place twice; prepare the shards again")
+    passes = index.passes if isinstance(index, ShardSets) else 1
+    parts, left = [], 0
+    for turn in range(epoch * passes, (epoch + 1) * passes):
+        rows = _rows(index, turn, seed)
+        if len(rows) < places_per_batch:
+            raise UsageError(
+                f"data.places_per_batch is {places_per_batch}, but a pass over {index.root} has only {len(rows)} "
+                f"places: lower it, or prepare more places"
+            )
+        left = len(rows) % places_per_batch
+        rows = rows[_kept(len(rows), left, seed, turn)]
+        parts.append(_ordered(index, rows, seed, turn, places_per_batch, order, window_shards, mined))
+    turns = np.repeat(np.arange(epoch * passes, (epoch + 1) * passes), len(parts[0]))
+    return EpochPlan(np.concatenate(parts), left, turns)
 
-    left = len(rows) % places_per_batch
-    rows = rows[_kept(len(rows), left, seed, epoch)]
-    keys = _random(len(rows), "places", seed, epoch)
-    if order == "city":
-        batches = _shuffled(_in_cities(index, rows, keys, places_per_batch, seed, epoch), seed, epoch)
-    elif order == "mixed":
-        batches = rows[np.argsort(keys, kind="stable")].reshape(-1, places_per_batch)
-    else:
-        window = _shuffled_groups(_column(index, "shard")[rows], "shards", seed, epoch) // window_shards
-        batches = rows[np.lexsort((keys, window))].reshape(-1, places_per_batch)
-    return EpochPlan(batches, left, which)
+
+def _rows(index: ShardIndex, turn: int, seed: int) -> Rows:
+    """The rows of a pass, by place, whatever order the shards were written in."""
+    places = _column(index, "place")
+    if not isinstance(index, ShardSets):
+        rows = np.flatnonzero(_column(index, "round") == turn % max(index.rounds, 1)).astype(np.int64)
+        rows = rows[np.argsort(places[rows], kind="stable")]
+        if len(np.unique(places[rows])) != len(rows):
+            raise DataError(f"{index.root}: a round of the index holds a place twice; prepare the shards again")
+        return rows
+    chosen = []
+    every = np.lexsort((places, _column(index, "round")))
+    ends = np.cumsum([part.table.num_rows for part in index.sets])
+    for number, (part, first, share) in enumerate(zip(index.sets, index.offsets, index.shares, strict=True)):
+        own = every[(every >= ends[number] - part.table.num_rows) & (every < ends[number])]
+        grid = own.reshape(part.rounds, -1)  # [rounds, places]: every round holds every place
+        if grid.shape[1] != part.places or (places[grid] != first + np.arange(part.places)).any():
+            raise DataError(
+                f"{part.root}: a round of the index does not hold each place once; prepare the shards again"
+            )
+        at = np.arange(turn * share, (turn + 1) * share)  # the set's places, endlessly one round after the other
+        order = np.argsort(random(part.places, "turns", seed, number), kind="stable")
+        chosen.append(grid[at // part.places % part.rounds, order[at % part.places]])
+    rows = np.concatenate(chosen).astype(np.int64)
+    return rows[np.argsort(places[rows], kind="stable")]
+
+
+def _ordered(
+    index: ShardIndex, rows: Rows, seed: int, turn: int, size: int, order: Order, window_shards: int,
+    mined: Mined | None,
+) -> Rows:  # fmt: skip
+    """Batches [steps, size] of the rows of a pass."""
+    keys = random(len(rows), "places", seed, turn)
+    if order == "mixed":
+        return rows[np.argsort(keys, kind="stable")].reshape(-1, size)
+    if order == "blocked":
+        window = _shuffled_groups(_column(index, "shard")[rows], "shards", seed, turn) // window_shards
+        return rows[np.lexsort((keys, window))].reshape(-1, size)
+    if mined is not None and order == "mined":
+        places = _column(index, "place")[rows]
+        made = cliques(mined, places, keys, seed, turn).reshape(-1)
+        first = np.full(int(places.max()) + 1, len(made))
+        first[made] = np.arange(len(made))
+        rank = np.lexsort((keys, first[places]))  # clique after clique, then the others by their keys
+        keys = np.empty(len(rows), np.uint64)
+        keys[rank] = np.arange(len(rows), dtype=np.uint64)
+    return _shuffled(_in_cities(index, rows, keys, size, seed, turn), seed, turn)
 
 
 def _in_cities(index: ShardIndex, rows: Rows, keys: NDArray[np.uint64], size: int, seed: int, epoch: int) -> Rows:
@@ -111,33 +157,27 @@ def _in_cities(index: ShardIndex, rows: Rows, keys: NDArray[np.uint64], size: in
     return np.concatenate([rows[full], rows[~full]]).reshape(-1, size)
 
 
-def _kept(total: int, left: int, seed: int, epoch: int) -> NDArray[np.bool_]:
-    """Which places are kept: `left` are skipped, the next ones in a fixed random order each epoch.
+def _kept(total: int, left: int, seed: int, turn: int) -> NDArray[np.bool_]:
+    """Which places are kept: `left` are skipped, the next ones in a fixed random order each turn.
 
-    `left` < a batch <= total - left, so two epochs in a row never skip the same place.
+    `left` < a batch <= total - left, so two turns in a row never skip the same place.
     """
     keep = np.ones(total, dtype=np.bool_)
-    skipped = (np.arange(left) + epoch * left) % total
-    keep[np.argsort(_random(total, "left", seed), kind="stable")[skipped]] = False
+    skipped = (np.arange(left) + turn * left) % total
+    keep[np.argsort(random(total, "left", seed), kind="stable")[skipped]] = False
     return keep
 
 
 def _shuffled(batches: Rows, seed: int, epoch: int) -> Rows:
-    return batches[np.argsort(_random(len(batches), "batches", seed, epoch), kind="stable")]
+    return batches[np.argsort(random(len(batches), "batches", seed, epoch), kind="stable")]
 
 
 def _shuffled_groups(codes: Rows, *purpose: object) -> Rows:
     """Each row's group as a number 0..groups-1, the groups numbered in random order."""
     unique, codes = np.unique(codes, return_inverse=True)
     number = np.empty(len(unique), dtype=np.int64)
-    number[np.argsort(_random(len(unique), *purpose), kind="stable")] = np.arange(len(unique))
+    number[np.argsort(random(len(unique), *purpose), kind="stable")] = np.arange(len(unique))
     return number[codes]
-
-
-def _random(n: int, *purpose: object) -> NDArray[np.uint64]:
-    """n random 64-bit keys that depend on `purpose` alone."""
-    digest = hashlib.sha256("|".join(map(str, purpose)).encode()).digest()
-    return np.random.Philox(key=int.from_bytes(digest[:16], "little")).random_raw(n)
 
 
 def _column(index: ShardIndex, name: str) -> Rows:

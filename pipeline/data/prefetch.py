@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from pipeline.common.errors import UserError
 from pipeline.data.cache import ShardCache
+from pipeline.data.shard_sets import ShardSetsCache
 
 
 class FetchAhead(threading.Thread):
@@ -22,7 +23,7 @@ class FetchAhead(threading.Thread):
         step: the first step that is still to come.
     """
 
-    def __init__(self, cache: ShardCache, shards: Sequence[Sequence[str]], step: int) -> None:
+    def __init__(self, cache: ShardCache | ShardSetsCache, shards: Sequence[Sequence[str]], step: int) -> None:
         super().__init__(name="fetch-ahead", daemon=True)
         self.cache, self.shards = cache, shards
         self.error: UserError | None = None
