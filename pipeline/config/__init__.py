@@ -31,22 +31,8 @@ class DataConfig:
     batch); empty: 1 for each set."""
     places_per_batch: int = 72
     """Places in the global batch, over all ranks; four images each (paper: 72, so 288 images)."""
-    order: Literal["city", "mixed", "blocked", "mined"] = "city"
-    """Order of places: in-city batches (as published in effect), mixed over cities, within windows of shards, or
-    in-city batches of places that look alike to the model (mined; the first epoch is as city)."""
-    mine_from: str = "single"
-    """mined: single: descriptors of each image alone, by the model being trained; bank: with its bank; permuted:
-    single's, shuffled among the places of each city, a control without hardness; or a file of jobs.mine."""
-    mine_every: int = 1
-    """mined: epochs between two minings, the first before the second epoch. Not used with a file."""
-    clique: int = 6
-    """mined: places that are grouped because they look alike; a batch is made of such groups."""
-    mine_neighbours: int = 64
-    """mined: most similar places of the same city that a group is drawn from."""
-    mine_radius: float = 25.0
-    """mined: no two places of a group lie closer than this, in metres; 0: positions are not used."""
-    mine_temperature: float = 0.05
-    """mined: randomness of the draw, in units of cosine similarity; 0 takes the most similar ones."""
+    order: Literal["city", "mixed", "blocked"] = "city"
+    """Order of places: in-city batches (as published in effect), mixed over cities, or within windows of shards."""
     window_shards: int = 8
     """Shards read together by order=blocked."""
     image_size: int = 224

@@ -1,9 +1,10 @@
 """Hard batches: groups of places that look alike but are not the same (after CliqueMining, Izquierdo and Civera, 2024).
 
-Invariant: cliques are a pure function of (descriptors, places, positions, settings, seed, turn), on every platform.
-Descriptors are fp16 of unit length, so a product of two numbers is a multiple of 2^-48 and no sum of them exceeds 2:
-float64 holds every similarity exactly, in whatever order it is summed. Similarities are then rounded to 2^-10, the
-random part too, and ties go to the smaller place number.
+Invariant: cliques are a pure function of (descriptors, places, positions, settings, seed, turn). Descriptors are fp16
+of unit length, so a product of two numbers is a multiple of 2^-48 and no sum of them exceeds 2: float64 holds every
+similarity exactly, in whatever order a library sums it. Similarities are then rounded to 2^-10, the random part too,
+and ties go to the smaller place number. (The random part has two logarithms: on a platform that rounds their last bit
+in another way, a draw differs with a chance of about 1e-14.)
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ def cliques(mined: Mined, places: Rows, keys: NDArray[np.uint64], seed: int, tur
         keys: [n] random keys of the seeds' order.
     """
     rule = mined.rule
-    total, k = mined.near.shape
+    total = len(mined.near)
     ranked = _ranked(mined, seed, turn)
     free = np.zeros(total + 1, np.bool_)  # the last one is what -1 points at, and never free
     free[places] = True

@@ -111,14 +111,15 @@ def _rows(index: ShardIndex, turn: int, seed: int) -> Rows:
     ends = np.cumsum([part.table.num_rows for part in index.sets])
     for number, (part, first, share) in enumerate(zip(index.sets, index.offsets, index.shares, strict=True)):
         own = every[(every >= ends[number] - part.table.num_rows) & (every < ends[number])]
-        grid = own.reshape(part.rounds, -1)  # [rounds, places]: every round holds every place
-        if grid.shape[1] != part.places or (places[grid] != first + np.arange(part.places)).any():
+        shape = (part.rounds, part.places)
+        expected = np.tile(first + np.arange(part.places), part.rounds)
+        if not np.array_equal(places[own], expected):
             raise DataError(
                 f"{part.root}: a round of the index does not hold each place once; prepare the shards again"
             )
         at = np.arange(turn * share, (turn + 1) * share)  # the set's places, endlessly one round after the other
         order = np.argsort(random(part.places, "turns", seed, number), kind="stable")
-        chosen.append(grid[at // part.places % part.rounds, order[at % part.places]])
+        chosen.append(own.reshape(shape)[at // part.places % part.rounds, order[at % part.places]])
     rows = np.concatenate(chosen).astype(np.int64)
     return rows[np.argsort(places[rows], kind="stable")]
 

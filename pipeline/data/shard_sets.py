@@ -79,15 +79,14 @@ def open_shards(data: DataConfig) -> ShardIndex:
         raise UsageError(
             f"data.shard_weights has {len(data.shard_weights)} numbers for {len(roots)} sets in data.shards"
         )
-    weights = tuple(
-        Fraction(str(weight)).limit_denominator(10_000) for weight in data.shard_weights or [1] * len(roots)
-    )
-    for root, weight in zip(roots, weights, strict=True):
+    given = data.shard_weights or (1,) * len(roots)
+    for root, weight in zip(roots, given, strict=True):
         if not 0 < weight <= 100:
             raise UsageError(
-                f"data.shard_weights: {float(weight):g} for {root}; weights are above 0 and at most 100 (to leave a set "
-                f"out, take it out of data.shards)"
+                f"data.shard_weights: {weight:g} for {root}; weights are above 0 and at most 100 (to leave a set out, "
+                f"take it out of data.shards)"
             )
+    weights = tuple(Fraction(str(weight)) for weight in given)
     sets = tuple(read_index(root) for root in roots)
     if len(sets) == 1 and weights == (1,):
         return sets[0]

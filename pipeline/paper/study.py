@@ -176,19 +176,19 @@ def _weights(study: Study, base: RunConfig) -> None:
         study.missing.append(f"{weights}: the backbone's weights are not there")
 
 
-_STEPS: dict[tuple[str, int, str, int], int] = {}
+_STEPS: dict[object, int] = {}
 _DIMENSIONS: dict[tuple[object, int], int] = {}
 
 
 def _steps_per_epoch(study: Study, config: RunConfig) -> int | None:
     from pipeline.data.plan import plan
-    from shards.index import read_index
+    from pipeline.data.shard_sets import open_shards
 
     data = config.data
-    key = (data.shards, data.places_per_batch, data.order, data.window_shards)
+    key = (data.shards, data.shard_weights, data.places_per_batch, data.order, data.window_shards)
     if key not in _STEPS:
         try:
-            index = read_index(data.shards)
+            index = open_shards(data)
         except DataError as error:
             if str(error) not in study.missing:
                 study.missing.append(str(error))

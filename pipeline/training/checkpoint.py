@@ -194,5 +194,10 @@ def check_same(saved: dict[str, Any], config: RunConfig, state: RunState, index:
     if state.index != index:
         raise UsageError(
             f"cannot resume {config.name}: the shards in {config.data.shards} are not those it started with "
-            f"(index {index[:12]}, was {state.index[:12]}); choose another --name"
+            f"(index {_short(index)}, was {_short(state.index)}); choose another --name"
         )
+
+
+def _short(digest: str) -> str:
+    """The first digits of each set's digest (of several sets they are joined by "+")."""
+    return " + ".join(part[:12] for part in digest.split("+"))

@@ -12,9 +12,10 @@ from pipeline.common.text import Table
 from pipeline.config import RunConfig
 from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
+from pipeline.data.shard_sets import ShardSets, open_shards
 from pipeline.distributed import world_size
 from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
-from shards.index import ShardIndex, read_index
+from shards.index import ShardIndex
 
 # whole copies of the trainable parameters that the optimiser keeps
 MOMENTS = {"adam": 2, "adamw": 2, "sgd": 0}
@@ -43,7 +44,7 @@ def preview(config: RunConfig) -> list[tuple[str, str]]:
     Raises:
         UsageError, DataError: whatever would stop the run at its start.
     """
-    index = read_index(config.data.shards)
+    index = open_shards(config.data)
     rows = _plan_rows(config, index)
     torch.manual_seed(config.seed)
     model = build_model(config.model, config.data.image_size)
@@ -65,10 +66,13 @@ def _plan_rows(config: RunConfig, index: ShardIndex) -> list[tuple[str, str]]:
     images = 4 * data.places_per_batch
     total = steps * config.train.epochs
     limited = min(total, config.train.steps) if config.train.steps is not None else total
-    rounds = int(index.table.column("round").to_numpy().max()) + 1
-    places = int(index.table.column("place").to_numpy().max()) + 1
+    sets = index.sets if isinstance(index, ShardSets) else (index,)
+    given = [f", {share * index.passes:,} an epoch" for share in index.shares] if isinstance(index, ShardSets) else [""]
     return [
-        ("shards", f"{data.shards}: {places:,} places, {rounds} rounds of four images"),
+        *(
+            ("shards", f"{part.root}: {part.places:,} places, {part.rounds} rounds of four images{each}")
+            for part, each in zip(sets, given, strict=True)
+        ),
         ("global batch", f"{data.places_per_batch} places x 4 = {images} images, order {data.order}"),
         ("processes", f"{w}, {images // w} images each"),
         ("epoch", f"{steps:,} steps; {first.left_over:,} places wait for another epoch"),

@@ -25,6 +25,7 @@ from pipeline.data.images import normalise
 from pipeline.data.places import Batch, build_loader
 from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
+from pipeline.data.shard_sets import open_shards
 from pipeline.distributed import agree, on_rank_0, rank, world_size
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.files import frozen_hash, load_trainable, save_model, saved_names
@@ -40,7 +41,7 @@ from pipeline.training.meter import Meter
 from pipeline.training.schedule import build_optimizer, learning_rate
 from pipeline.training.tracking import Tracker
 from pipeline.training.validation import Validation
-from shards.index import ShardIndex, read_index
+from shards.index import ShardIndex
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class Trainer:
         self.config, self.accelerator = config, accelerator
         self.main = rank() == 0
         self.run = Path(config.output) / config.name
-        self.index = read_index(config.data.shards)
+        self.index = open_shards(config.data)
         self.steps_per_epoch = len(self._plan(0).batches)
         check_batch(config, self.steps_per_epoch)
         self.total_steps = self.steps_per_epoch * config.train.epochs
