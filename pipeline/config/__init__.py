@@ -25,7 +25,7 @@ class DataConfig:
     """What is trained on, in which order, and how images are prepared."""
 
     shards: tuple[str, ...] | str = "data/shards"
-    """Folder, or any fsspec URL, of a shard set made by jobs.prepare; or a list of them: one training over all."""
+    """Folder, or any fsspec URL, of a shard set made by jobs.prepare; or a list, `[a, b]`: one training over all."""
     shard_weights: tuple[float, ...] = ()
     """How often a place of each set comes in an epoch, above 0: 0.5 half of the places, 2 each twice (never in one
     batch); empty: 1 for each set."""
