@@ -38,8 +38,7 @@ def test_every_shown_command_parses(page: str, command: str, monkeypatch: pytest
     for stop in ("|", "&&", ";", ">", "&"):
         arguments = arguments[: arguments.index(stop)] if stop in arguments else arguments
     module = importlib.import_module(name)
-    entry = "parse_part" if hasattr(module, "parse_part") else "parse"
-    real = getattr(module, entry)
+    real = module.parse
 
     def parse(*given: Any, **named: Any) -> Any:
         real(*given, **named)
@@ -47,7 +46,7 @@ def test_every_shown_command_parses(page: str, command: str, monkeypatch: pytest
 
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr("sys.argv", [name, *arguments])
-    monkeypatch.setattr(module, entry, parse)
+    monkeypatch.setattr(module, "parse", parse)
     if "--help" in arguments:
         with pytest.raises(SystemExit):
             module.main()

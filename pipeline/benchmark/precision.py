@@ -57,11 +57,11 @@ class Result:
     gradients: dict[str, Tensor]
 
 
-def run(model: PlaceModel, images: Tensor, labels: Tensor, dtype: torch.dtype | None) -> Result:
+def run(model: PlaceModel, images: Tensor, labels: Tensor, dtype: torch.dtype | None, joint: bool = False) -> Result:
     """One forward and backward; `dtype` is autocast's, None computes as the model's own type."""
     scale = FP16_SCALE if dtype == torch.float16 else 1.0
     with autocast(images.device, dtype):
-        descriptors = model(images)
+        descriptors = model(images, joint=joint)
     loss = MultiSimilarityLoss()(descriptors, labels)
     model.zero_grad(set_to_none=True)
     (loss * scale).backward()
@@ -89,14 +89,14 @@ def errors(truth: Result, found: Result) -> Errors:
     )
 
 
-def compare(size: Size, images: int, device: torch.device) -> dict[str, Errors]:
+def compare(size: Size, images: int, device: torch.device, joint: bool = False) -> dict[str, Errors]:
     """Errors of each precision at a size, in training mode (batch statistics, attention over the batch)."""
     pixels, labels = batch(size, images, device)
     model = build(size).to(device)
     exact = copy.deepcopy(model).double()
-    truth = run(exact, pixels.double(), labels, None)
+    truth = run(exact, pixels.double(), labels, None, joint)
     del exact
-    return {name: errors(truth, run(model, pixels, labels, dtype)) for name, dtype in PRECISIONS.items()}
+    return {name: errors(truth, run(model, pixels, labels, dtype, joint)) for name, dtype in PRECISIONS.items()}
 
 
 def show(found: dict[str, Errors]) -> str:

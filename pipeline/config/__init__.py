@@ -143,6 +143,10 @@ class TrainConfig:
     """Linear warm-up in steps (published: 0)."""
     max_grad_norm: float | None = None
     """Largest norm of the gradient; none: no clipping (published: none)."""
+    passes: Literal["group", "joint"] = "group"
+    """group: each image is described in the global batch (paper). joint (ours): from the same regions also alone, and
+    one loss is taken over both descriptions of all images, so that the weights also serve a single photo. The backbone
+    runs once; needs a cross-image encoder."""
     validate_first: bool = True
     """Evaluate the untrained model before the first step, so that a run shows what training added."""
     patience: int = 3

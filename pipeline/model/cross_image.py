@@ -2,7 +2,9 @@
 
 Invariant: in training every image attends to the global batch, whatever the number of ranks; in evaluation the
 images given are one group on this rank alone. Cost a rank and layer: attention of its own b queries against the B
-gathered keys and values, one all-gather of B*R*2D numbers, one reduce-scatter of the same size backward.
+gathered keys and values, one all-gather of B*R*2D numbers, one reduce-scatter of the same size backward. Images that
+attend to themselves only need no other rank; they go through the same call, so that joint training (each image in the
+global batch and alone) calls every layer once and a sharding engine gathers its parameters once.
 """
 
 from __future__ import annotations
@@ -29,16 +31,24 @@ class CrossImageAttention(nn.Module):
         nn.init.xavier_uniform_(self.in_proj_weight)
         nn.init.zeros_(self.out_proj.bias)
 
-    def forward(self, x: Tensor, alone: bool = False) -> Tensor:
+    def forward(self, x: Tensor, alone: int = 0) -> Tensor:
         """[b, R, D] -> [b, R, D]: each region's b images (queries) over that region's B images (keys, values).
 
-        `alone`: every image over itself only. The softmax over one key is 1, so what is attended to is the value.
+        `alone`: the last so many images attend to themselves only, and nobody else attends to them. The softmax over
+        one key is 1, so what is attended to is the value.
         """
-        dim = x.shape[-1]
+        together, dim = len(x) - alone, x.shape[-1]
+        attended = []
+        if together:
+            attended.append(self._over_all(x[:together]))
         if alone:
-            value = F.linear(x, self.in_proj_weight[2 * dim :], self.in_proj_bias[2 * dim :])
-            itself: Tensor = self.out_proj(value)
-            return itself
+            attended.append(F.linear(x[together:], self.in_proj_weight[2 * dim :], self.in_proj_bias[2 * dim :]))
+        out: Tensor = self.out_proj(torch.cat(attended))
+        return out
+
+    def _over_all(self, x: Tensor) -> Tensor:
+        """[b, R, D] -> [b, R, D], before the output's projection."""
+        dim = x.shape[-1]
         query, key_value = F.linear(x, self.in_proj_weight, self.in_proj_bias).split((dim, 2 * dim), dim=-1)
         if self.training:
             # projected on the rank that owns the image, then gathered once: the projection is not repeated W times
@@ -47,8 +57,7 @@ class CrossImageAttention(nn.Module):
         query, key, value = self._by_region(query), self._by_region(key), self._by_region(value)
         dropout = self.dropout if self.training else 0.0
         attended = F.scaled_dot_product_attention(query, key, value, dropout_p=dropout)  # [R, heads, b, D / heads]
-        out: Tensor = self.out_proj(attended.permute(2, 0, 1, 3).flatten(2))
-        return out
+        return attended.permute(2, 0, 1, 3).flatten(2)
 
     def _by_region(self, x: Tensor) -> Tensor:
         """[n, R, D] -> [R, heads, n, D / heads]: the images become the sequence."""
@@ -67,7 +76,7 @@ class CrossImageLayer(nn.Module):
         self.norm2 = nn.LayerNorm(dim)
         self.dropout = nn.Dropout(config.dropout)
 
-    def forward(self, x: Tensor, alone: bool = False) -> Tensor:
+    def forward(self, x: Tensor, alone: int = 0) -> Tensor:
         """[b, R, D] -> [b, R, D]; `alone` as in the attention."""
         x = self.norm1(x + self.dropout(self.self_attn(x, alone)))
         hidden = self.dropout(F.gelu(self.linear1(x)))
@@ -89,8 +98,22 @@ class CrossImageEncoder(nn.Module):
         self.alone = config.alone
         self.layers = nn.ModuleList(CrossImageLayer(dim, config) for _ in range(config.layers))
 
-    def forward(self, regions: Tensor, alone: bool = False) -> Tensor:
-        """[b, R, D] -> [b, R, D]; `alone`: of b groups of one image each, not of one group (the config's, too)."""
+    def forward(self, regions: Tensor, alone: int = 0) -> Tensor:
+        """[b, R, D] -> [b, R, D]; `alone`: the last so many images are groups of one (the config's: all)."""
         for layer in self.layers:
-            regions = layer(regions, alone or self.alone)
+            regions = layer(regions, len(regions) if self.alone else alone)
         return regions
+
+
+def check_crossing(config: CrossImageConfig, wanted: str) -> None:
+    """Refuses `wanted`, a setting that needs images to attend to each other.
+
+    Raises:
+        UsageError: the model has no cross-image encoder, or one whose images attend to themselves only.
+    """
+    if not config.layers:
+        raise UsageError(f"{wanted} needs a cross-image encoder, and model.cross_image.layers is 0: leave it out")
+    if config.alone:
+        raise UsageError(
+            f"{wanted} needs images that attend to each other, and model.cross_image.alone is set: leave one out"
+        )

@@ -87,13 +87,23 @@ class PlaceModel(nn.Module):
 
         `alone`: b groups of one image each in one call, equal to b calls but for rounding.
         """
-        related = self.cross_image(regions, alone)
-        with torch.autocast(regions.device.type, enabled=False):
+        return self._flat(self.cross_image(regions, len(regions) if alone else 0))
+
+    def correlate_jointly(self, regions: Tensor) -> Tensor:
+        """Every image described twice, in the group and alone: [b, R, D] -> [2b, R*D], of unit length.
+
+        Rows: the b images of the group (in training: of the global batch), then the same b images each alone.
+        """
+        return self._flat(self.cross_image(torch.cat((regions, regions)), len(regions)))
+
+    def _flat(self, related: Tensor) -> Tensor:
+        with torch.autocast(related.device.type, enabled=False):
             return F.normalize(at_least_float32(related).flatten(1), dim=-1)
 
-    def forward(self, images: Tensor, chunk: int | None = None) -> Tensor:
-        """`correlate(encode(images, chunk))`: [b, 3, S, S] -> [b, R*D]."""
-        return self.correlate(self.encode(images, chunk))
+    def forward(self, images: Tensor, chunk: int | None = None, joint: bool = False) -> Tensor:
+        """`correlate(encode(images, chunk))`: [b, 3, S, S] -> [b, R*D]; `joint`: `correlate_jointly`, [2b, R*D]."""
+        regions = self.encode(images, chunk)
+        return self.correlate_jointly(regions) if joint else self.correlate(regions)
 
 
 def build_model(config: ModelConfig, image_size: int) -> PlaceModel:

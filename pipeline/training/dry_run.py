@@ -21,7 +21,7 @@ from shards.index import ShardIndex
 MOMENTS = {"adam": 2, "adamw": 2, "sgd": 0}
 
 
-def saved_bytes(model: PlaceModel, images: int) -> int:
+def saved_bytes(model: PlaceModel, images: int, joint: bool = False) -> int:
     """Bytes autograd keeps for the backward of `images` images through encode and correlate, parameters left out."""
     parameters = {p.untyped_storage().data_ptr() for p in model.parameters()}
     seen: dict[int, int] = {}
@@ -33,7 +33,7 @@ def saved_bytes(model: PlaceModel, images: int) -> int:
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-        keep = model(torch.zeros(images, 3, model.image_size, model.image_size))
+        keep = model(torch.zeros(images, 3, model.image_size, model.image_size), joint=joint)
     del keep
     return sum(seen.values())
 
@@ -83,12 +83,13 @@ def _plan_rows(config: RunConfig, index: ShardIndex) -> list[tuple[str, str]]:
 def _size_rows(config: RunConfig, model: PlaceModel, counts: dict[str, int]) -> list[tuple[str, str]]:
     trained, w = counts["trainable"], world_size()
     model.train()
-    one, three = saved_bytes(model, 4), saved_bytes(model, 8)
+    joint = config.train.passes == "joint"
+    one, three = saved_bytes(model, 4, joint), saved_bytes(model, 8, joint)
     each = max(0, three - one) / 4
     b = 4 * config.data.places_per_batch // w
     at_once = min(b, config.train.encode_chunk or b)
     fixed = counts["total"] * 4 + trained * 4 * (1 + MOMENTS[config.train.optimizer])
-    descriptors = 4 * config.data.places_per_batch * model.descriptor_dim * 4 * 3
+    descriptors = 4 * config.data.places_per_batch * model.descriptor_dim * 4 * 3 * (2 if joint else 1)
     stored = trained * 4 * (1 + MOMENTS[config.train.optimizer])
     if config.model.backbone.weights is None:
         stored += (counts["total"] - trained) * 4

@@ -3,7 +3,9 @@
 Invariant: the value and the averaged gradient do not depend on the number of ranks. Each rank compares its own `b`
 anchors with all `B` gathered descriptors and takes the mean over its own anchors; the backward of the gather sums over
 ranks and the data-parallel wrapper averages, which is exactly the gradient of the global mean (pipeline.distributed).
-Cost a rank: receives (W-1)*b descriptors, computes b*B similarities; the redundant form would compute B*B.
+Cost a rank: receives (W-1)*b descriptors, computes b*B similarities; the redundant form would compute B*B. Where each
+image is described p times (joint training: p = 2, in the global batch and alone), b and B count descriptors: all p*B
+are compared with each other, and an image's other descriptions are positives of it.
 """
 
 from __future__ import annotations
@@ -24,11 +26,13 @@ class MiningStatistics:
 
     Attributes:
         anchors: share of anchors with at least one mined pair, 0 to 1.
+        by_pass: the same for each of an image's p descriptions.
         positives: mined positive pairs an anchor.
         negatives: mined negative pairs an anchor.
     """
 
     anchors: float
+    by_pass: tuple[float, ...]
     positives: float
     negatives: float
 
@@ -70,22 +74,25 @@ class MultiSimilarityLoss(nn.Module):
         """Loss of the global batch.
 
         Args:
-            descriptors: [b, dim], this rank's rows; the same b on every rank.
+            descriptors: [p*b, dim], this rank's rows, p descriptions of each image: all images in one way, then all in
+                the next (p = 1: [b, dim]). The same p and b on every rank.
             labels: [b] integers, the same number for the same place on every rank.
 
         Returns:
-            Scalar whose value is the mean over all B anchors (an anchor without mined pairs counts 0) and whose
+            Scalar whose value is the mean over all p*B anchors (an anchor without mined pairs counts 0) and whose
             gradient is that of this rank's own mean, to be averaged over ranks. Without any mined pair it is 0 with
             a zero gradient.
 
         Raises:
             ValueError: shapes do not fit.
         """
-        if descriptors.ndim != 2 or labels.shape != descriptors.shape[:1]:
+        if descriptors.ndim != 2 or labels.ndim != 1 or not len(labels) or len(descriptors) % len(labels):
             raise ValueError(
-                f"descriptors {tuple(descriptors.shape)} need [b, dim] and labels {tuple(labels.shape)} [b]"
+                f"descriptors {tuple(descriptors.shape)} need [p*b, dim] and labels {tuple(labels.shape)} [b]"
             )
-        b = descriptors.shape[0]
+        b = len(descriptors)
+        passes = b // len(labels)
+        labels = labels.repeat(passes)
         with torch.autocast(descriptors.device.type, enabled=False):
             own = F.normalize(descriptors.to(torch.promote_types(descriptors.dtype, torch.float32)), dim=1)
             similarity = own @ gather(own).T  # [b, B]
@@ -96,11 +103,12 @@ class MultiSimilarityLoss(nn.Module):
         different = ~same & ~self._near(labels, everyone)
         positive, negative = self.mine(similarity.detach(), same & ~itself, different)
 
-        push = self.soft_sum(-self.alpha * (similarity - self.base), positive) / self.alpha
-        pull = self.soft_sum(self.beta * (similarity - self.base), negative) / self.beta
+        push = self._soft_sum(-self.alpha * (similarity - self.base), positive) / self.alpha
+        pull = self._soft_sum(self.beta * (similarity - self.base), negative) / self.beta
         local = (push + pull).mean()
 
-        counts = torch.stack([(positive.any(1) | negative.any(1)).sum(), positive.sum(), negative.sum()])
+        anchors = (positive.any(1) | negative.any(1)).view(passes, -1).sum(1)
+        counts = torch.cat([anchors, positive.sum()[None], negative.sum()[None]])
         # one small all-reduce carries the loss's global value and the mining counts
         summary = torch.cat([local.detach()[None], counts.to(local.dtype)])
         if is_distributed():
@@ -137,11 +145,14 @@ class MultiSimilarityLoss(nn.Module):
         if self._summary is None:
             raise RuntimeError("no batch has been through the loss yet")
         total, counts = self._summary
-        anchors, positives, negatives = counts.tolist()
-        return MiningStatistics(anchors / total, positives / total, negatives / total)
+        *anchors, positives, negatives = counts.tolist()
+        each = total / len(anchors)
+        return MiningStatistics(
+            sum(anchors) / total, tuple(n / each for n in anchors), positives / total, negatives / total
+        )
 
     @staticmethod
-    def soft_sum(exponent: Tensor, mask: Tensor) -> Tensor:
+    def _soft_sum(exponent: Tensor, mask: Tensor) -> Tensor:
         """log(1 + sum over the mask of e^exponent) for each row, without overflow: [b, B] -> [b]."""
         exponent = exponent.masked_fill(~mask, -torch.inf)
         return torch.logsumexp(torch.cat([exponent.new_zeros(len(exponent), 1), exponent], dim=1), dim=1)

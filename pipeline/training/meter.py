@@ -23,13 +23,13 @@ class Report:
 
     Attributes:
         loss: of the global batch.
-        mined: percent of anchors with a mined pair.
+        mined: percent of anchors with a mined pair, for each description of an image (joint training has two).
         images_per_second: over all ranks.
         data_wait: percent of the time spent waiting for the loader.
     """
 
     loss: float
-    mined: float
+    mined: tuple[float, ...]
     images_per_second: float
     data_wait: float
 
@@ -49,7 +49,7 @@ class Meter:
         self._bar = Progress(f"epoch {state.epoch + 1}", total, "steps", enabled=enabled)
         self._bar.resume_at(state.step)
         self._losses: list[float] = []
-        self._mined: list[float] = []
+        self._mined: list[tuple[float, ...]] = []
         self._waited = 0.0
         self._since = time.perf_counter()
         self._shown: Report | None = None
@@ -72,14 +72,15 @@ class Meter:
             self._waited += time.perf_counter() - start
             yield batch
 
-    def record(self, loss: float, mined: float) -> None:
-        """One step's loss and share of anchors with a mined pair; moves the progress line."""
+    def record(self, loss: float, mined: tuple[float, ...]) -> None:
+        """One step's loss and shares of anchors with a mined pair; moves the progress line."""
         self._losses.append(loss)
-        self._mined.append(100 * mined)
+        self._mined.append(tuple(100 * share for share in mined))
         now = self._current()
+        mined_now = " and alone ".join(f"{percent:.0f}%" for percent in now.mined)
         self._bar.advance(
             1,
-            f"loss {now.loss:.4f}  mined {now.mined:.0f}%  {now.images_per_second:.0f} images/s  "
+            f"loss {now.loss:.4f}  mined {mined_now}  {now.images_per_second:.0f} images/s  "
             f"data wait {now.data_wait:.0f}%",
         )
 
@@ -94,7 +95,7 @@ class Meter:
         seconds = max(time.perf_counter() - self._since, 1e-9)
         return Report(
             sum(self._losses) / n,
-            sum(self._mined) / n,
+            tuple(sum(kind) / n for kind in zip(*self._mined, strict=True)),
             self.images * len(self._losses) / seconds,
             100 * self._waited / seconds,
         )

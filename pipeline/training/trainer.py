@@ -27,6 +27,7 @@ from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import open_shards
 from pipeline.distributed import agree, on_rank_0, rank, world_size
+from pipeline.model.cross_image import check_crossing
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.files import frozen_hash, load_trainable, save_model, saved_names
 from pipeline.training import checkpoint
@@ -163,7 +164,7 @@ class Trainer:
         images = normalise(batch.images.to(self.accelerator.device, non_blocking=True))
         labels = batch.labels.to(self.accelerator.device, non_blocking=True)
         with self.accelerator.autocast():
-            descriptors = self.engine(images, chunk=config.train.encode_chunk)
+            descriptors = self.engine(images, chunk=config.train.encode_chunk, joint=config.train.passes == "joint")
         loss = self.loss(descriptors, labels)
         value = loss.detach().item()  # the global batch's loss, the same on every rank
         if not math.isfinite(value):
@@ -179,13 +180,13 @@ class Trainer:
             self.samples.write(json.dumps({"step": state.step, "epoch": state.epoch, "samples": batch.keys}) + "\n")
             self.samples.flush()
         mined = self.loss.statistics()
-        meter.record(value, mined.anchors)
+        meter.record(value, mined.by_pass)
         if state.step % config.train.log_every == 0 or state.step == self.total_steps:
             report = meter.report()
             self.tracker.metrics(
                 {
                     "train/loss": report.loss,
-                    "train/mined_anchors": report.mined,
+                    **mined_metrics(report.mined),
                     "train/mined_positives": mined.positives,
                     "train/mined_negatives": mined.negatives,
                     "train/images_per_second": report.images_per_second,
@@ -327,13 +328,23 @@ def build_loss(config: RunConfig, index: ShardIndex) -> MultiSimilarityLoss:
     return MultiSimilarityLoss(loss.alpha, loss.beta, loss.base, loss.margin, loss.ignore_within, points)
 
 
+def mined_metrics(mined: tuple[float, ...]) -> dict[str, float]:
+    """Percent of anchors with a mined pair, over all; of joint training also for each kind of description."""
+    named = {"train/mined_anchors": sum(mined) / len(mined)}
+    if len(mined) == 2:
+        named["train/mined_anchors_group"], named["train/mined_anchors_alone"] = mined
+    return named
+
+
 def check_batch(config: RunConfig, steps_per_epoch: int) -> None:
-    """Refuses a global batch that cannot be cut equally or never fills.
+    """Refuses a global batch that cannot be cut equally or never fills, and passes that the model cannot give.
 
     Raises:
         UsageError: with the numbers.
     """
     places, w = config.data.places_per_batch, world_size()
+    if config.train.passes == "joint":
+        check_crossing(config.model.cross_image, "train.passes joint")
     if places % w:
         raise UsageError(
             f"data.places_per_batch {places} cannot be cut equally over {w} processes; use a multiple of {w}"

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from processes import run_ranks
 from torch import Tensor, nn
 
-from pipeline.config import CrossImageConfig
+from pipeline.common.errors import UsageError
+from pipeline.config import CrossImageConfig, ModelConfig, RunConfig, TrainConfig
 from pipeline.distributed import rank_slice
 from pipeline.model.cross_image import CrossImageEncoder
+from pipeline.training.trainer import check_batch
 
 IMAGES, REGIONS, DIM = 12, 3, 16
 CONFIG = CrossImageConfig(layers=2, heads=4, feedforward=24, dropout=0.0)
@@ -93,6 +97,16 @@ def alone_on_a_rank() -> dict[str, Tensor]:
     encoder.alone = True
     mine = rank_slice(IMAGES)
     return results(encoder.train(), regions[mine], towards[mine])
+
+
+@pytest.mark.parametrize(
+    ("config", "reason"), [(CrossImageConfig(layers=0), "layers is 0"), (CrossImageConfig(alone=True), "alone is set")]
+)
+def test_what_needs_other_images_is_refused_without(config: CrossImageConfig, reason: str) -> None:
+    run = RunConfig(model=ModelConfig(cross_image=config), train=TrainConfig(passes="joint"))
+    with pytest.raises(UsageError, match=f"train.passes joint .*{reason}"):
+        check_batch(run, 1)
+    check_batch(replace(run, train=TrainConfig()), 1)
 
 
 def test_the_control_is_the_same_layers_over_groups_of_one_also_in_training() -> None:

@@ -36,7 +36,7 @@ def batches() -> list[Tensor]:
     return [(0.3 * places + n).reshape(PLACES * VIEWS, 3, SIZE, SIZE) for n in noise]
 
 
-def steps(config: ModelConfig, chunk: int | None = None) -> dict[str, Any]:
+def steps(config: ModelConfig, chunk: int | None = None, joint: bool = False) -> dict[str, Any]:
     """Three SGD steps on this rank's slices; what they computed, whole."""
     torch.manual_seed(3)
     model = build_model(config, SIZE).double()
@@ -54,13 +54,13 @@ def steps(config: ModelConfig, chunk: int | None = None) -> dict[str, Any]:
     losses, descriptors, gradients, mined = [], [], {}, []
     for number, images in enumerate(batches()):
         mine = rank_slice(len(images))
-        out = module(images[mine], chunk=chunk)
+        out = module(images[mine], chunk=chunk, joint=joint)
         loss = loss_function(out, labels[mine])
         optimizer.zero_grad()
         loss.backward()
         losses.append(loss.item())
         descriptors.append(out.detach())
-        mined.append(loss_function.statistics().anchors)
+        mined.append(loss_function.statistics())
         if number == 0:
             gradients = {n: p.grad.clone() for n, p in model.named_parameters() if p.requires_grad}
         optimizer.step()
@@ -83,19 +83,23 @@ VARIANTS = {
     "adapters_only": replace(SMALL, trainable="adapters"),
     "group_norm": replace(SMALL, adapter=replace(SMALL.adapter, norm="group")),
     "no_encoder": replace(SMALL, cross_image=replace(SMALL.cross_image, layers=0)),
+    "joint": SMALL,
 }
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_nothing_depends_on_the_number_of_processes(variant: str) -> None:
-    config = VARIANTS[variant]
-    truth = steps(config)
-    assert truth["mined"][0] > 0.5, "too few mined pairs: this test would prove little"
+    config, joint = VARIANTS[variant], variant == "joint"
+    truth = steps(config, None, joint)
+    assert len(truth["mined"][0].by_pass) == 1 + joint
+    assert min(truth["mined"][0].by_pass) > 0.5, "too few mined pairs: this test would prove little"
     assert all(g.abs().max() > 0 for n, g in truth["gradients"].items() if not n.endswith("conv.bias"))
     for world in (2, 4):
-        ranks = run_ranks(steps, world, config)
+        ranks = run_ranks(steps, world, config, None, joint)
         for number in range(STEPS):
-            together = torch.cat([r["descriptors"][number] for r in ranks])
+            # of joint training each rank holds its images in the global batch, then alone
+            parts = [r["descriptors"][number].chunk(1 + joint) for r in ranks]
+            together = torch.cat([part for kind in zip(*parts, strict=True) for part in kind])
             torch.testing.assert_close(together, truth["descriptors"][number], rtol=1e-9, atol=1e-11)
         for found in ranks:
             assert found["losses"] == pytest.approx(truth["losses"], rel=1e-9)
@@ -119,13 +123,36 @@ def test_gradients_tensor_by_tensor() -> None:
         assert difference < 1e-9, (name, float(difference))
 
 
-@pytest.mark.parametrize("variant", ["published", "adapters_only", "group_norm"])
+def test_joint_training_is_one_loss_over_two_passes_of_the_encoder() -> None:
+    """Written out: the images in one group, each image by itself, and a loss over all of them under doubled labels."""
+    torch.manual_seed(3)
+    model = build_model(SMALL, SIZE).double()
+    images, labels = batches()[0], torch.arange(PLACES).repeat_interleave(VIEWS)
+    found = []
+    for joint in (True, False):
+        model.zero_grad()
+        if joint:
+            loss = (ours := MultiSimilarityLoss())(model(images, joint=True), labels)
+        else:
+            regions = model.encode(images)
+            alone = [model.correlate(one[None]) for one in regions]
+            twice = torch.cat([model.correlate(regions), *alone])
+            loss = (plain := MultiSimilarityLoss())(twice, labels.repeat(2))
+        loss.backward()
+        found.append({n: p.grad.clone() for n, p in model.named_parameters() if p.grad is not None})
+        found[-1]["loss"] = loss.detach()
+    assert worst(*found) < 1e-12
+    assert ours.statistics().anchors == plain.statistics().anchors == sum(ours.statistics().by_pass) / 2
+    assert ours.statistics().positives == plain.statistics().positives > VIEWS - 1  # across both kinds of description
+
+
+@pytest.mark.parametrize("variant", ["published", "adapters_only", "group_norm", "joint"])
 @pytest.mark.parametrize("world", [1, 2])
 def test_chunks_give_the_same_gradients(world: int, variant: str) -> None:
     """Also with BatchNorm, whose statistics and buffers stay those of the global batch."""
-    config = VARIANTS[variant]
-    whole = steps(config)
-    found = steps(config, 5) if world == 1 else run_ranks(steps, world, config, 5)[1]
+    config, joint = VARIANTS[variant], variant == "joint"
+    whole = steps(config, None, joint)
+    found = steps(config, 5, joint) if world == 1 else run_ranks(steps, world, config, 5, joint)[1]
     for what in ("gradients", "weights", "buffers"):
         assert worst(whole[what], found[what]) < 1e-9
     assert found["losses"] == pytest.approx(whole["losses"], rel=1e-9)

@@ -12,7 +12,10 @@ from torch.nn import functional as F
 
 from pipeline.data.positions import points
 from pipeline.distributed import rank_slice, world_size
+from pipeline.training.checkpoint import RunState
 from pipeline.training.loss import MultiSimilarityLoss
+from pipeline.training.meter import Meter
+from pipeline.training.trainer import mined_metrics
 
 
 @pytest.mark.parametrize("case", ["C_72x4x128_hard", "E_4x4x32_hard"])
@@ -88,8 +91,21 @@ def test_bfloat16_descriptors_are_compared_in_float32() -> None:
     torch.testing.assert_close(MultiSimilarityLoss()(x, labels), MultiSimilarityLoss()(x.float(), labels))
 
 
+def test_a_person_sees_the_mined_anchors_of_both_kinds_of_description(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[str] = []
+    monkeypatch.setattr("pipeline.common.progress.Progress.advance", lambda self, n, text: shown.append(text))
+    meter = Meter(16, 2, RunState(index=""), enabled=False)
+    meter.record(0.5, (1.0, 0.5))
+    meter.record(0.5, (0.5, 0.5))
+    assert "mined 100% and alone 50%" in shown[0] and "mined 75% and alone 50%" in shown[1]
+    assert mined_metrics(meter.report().mined) == {
+        "train/mined_anchors": 62.5, "train/mined_anchors_group": 75.0, "train/mined_anchors_alone": 50.0
+    }  # fmt: skip
+    assert mined_metrics((80.0,)) == {"train/mined_anchors": 80.0}
+
+
 def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match="need \\[b, dim\\]"):
+    with pytest.raises(ValueError, match="need \\[p\\*b, dim\\]"):
         MultiSimilarityLoss()(torch.randn(4, 8), torch.zeros(5, dtype=torch.long))
 
 

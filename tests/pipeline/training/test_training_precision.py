@@ -21,9 +21,10 @@ def distance(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> float:
     return sum(((a[n] - b[n]).double() ** 2).sum().item() for n in a if a[n].is_floating_point()) ** 0.5
 
 
-def test_half_precision_strays_little_from_float64() -> None:
+@pytest.mark.parametrize("joint", [False, True])
+def test_half_precision_strays_little_from_float64(joint: bool) -> None:
     """Bounds a few times above what docs/performance.md measures; float32 shows that the comparison is a sharp one."""
-    found = compare(SIZES["tiny"], 16, torch.device("cpu"))
+    found = compare(SIZES["tiny"], 16, torch.device("cpu"), joint)
     for name, descriptor, loss, gradient in (
         ("float32", 1e-5, 1e-6, 1e-4),
         ("bf16", 3e-2, 1e-2, 1e-1),
@@ -55,8 +56,8 @@ def moved_from_start(root: Path, plain: dict[str, torch.Tensor]) -> float:
 
 
 def test_bf16_through_the_real_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three SGD steps. bf16 really ran (the weights differ from float32's) and strays little; the weights themselves
-    stay float32."""
+    """Three SGD steps of joint training. bf16 really ran (the weights differ from float32's) and strays little; the
+    weights themselves stay float32."""
     root, _ = both_precisions(tmp_path, monkeypatch)
     plain, half = (weights(root, name) for name in ("float32", "bf16"))
     assert all(t.dtype == torch.float32 for t in half.values() if t.is_floating_point())
@@ -67,7 +68,7 @@ def test_bf16_through_the_real_job(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_bf16_on_two_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same as on one, to bf16's own rounding."""
     root, config = both_precisions(tmp_path, monkeypatch)
-    launch(config, "bf16-two", 2, precision="bf16")
+    launch(config, "bf16-two", 2, "--train.passes", "joint", precision="bf16")
     plain, half, two = (weights(root, name) for name in ("float32", "bf16", "bf16-two"))
     moved = moved_from_start(root, plain)
     assert 0 < distance(plain, two) < 0.1 * moved
@@ -80,6 +81,7 @@ def both_precisions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Pa
     config = tiny_config(root)
     for name, precision in (("float32", "no"), ("bf16", "bf16")):
         monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", precision)
-        job = JobProcess("jobs.train", ["--config", str(config), "--name", name], tmp_path / f"{name}.txt")
+        options = ["--config", str(config), "--name", name, "--train.passes", "joint"]
+        job = JobProcess("jobs.train", options, tmp_path / f"{name}.txt")
         assert job.wait(240) == 0, job.text()[-3000:]
     return root, config

@@ -16,10 +16,10 @@ from launched import ENGINES, Launched
 from safetensors.torch import load_file
 from tiny import prepare, run_settings
 
-from pipeline.benchmark.engines import compare
 from pipeline.common.errors import UsageError
 from pipeline.config import TrainConfig
 from pipeline.model.weights.files import load_model
+from pipeline.training.engine_parity import compare
 from pipeline.training.engines.build import choose
 from pipeline.training.engines.zero import zero_settings
 
@@ -35,11 +35,15 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> dict[str, torch.Tensor]:
     return measured("ddp", 1, "float64", tmp_path_factory.mktemp("truth"))
 
 
+@pytest.fixture(scope="module")
+def joint_truth(tmp_path_factory: pytest.TempPathFactory) -> dict[str, torch.Tensor]:
+    """The same for joint training."""
+    return measured("ddp", 1, "float64", tmp_path_factory.mktemp("joint"), "--passes", "joint")
+
+
 def measured(engine: str, world: int, dtype: str, folder: Path, *options: str) -> dict[str, torch.Tensor]:
     file = folder / f"{engine}.safetensors"
-    Launched(
-        engine, world, "pipeline.benchmark.engines", ["--write", str(file), "--dtype", dtype, *options], file
-    ).done()
+    Launched(engine, world, "jobs.engines", ["--write", str(file), "--dtype", dtype, *options], file).done()
     return load_file(file)
 
 
@@ -49,6 +53,12 @@ def test_gradients_are_those_of_one_process(engine: str, truth: dict[str, torch.
     assert difference.tensors > 100
     assert difference.gradient < 1e-9, difference.tensor
     assert difference.weight < 1e-9
+
+
+def test_joint_training_shards_as_any_other(joint_truth: dict[str, torch.Tensor], tmp_path: Path) -> None:
+    """FSDP2, whose hooks gather each layer's parameters around its call; DDP is in test_training_global_batch.py."""
+    difference = compare(joint_truth, measured("fsdp2", 2, "float64", tmp_path, "--passes", "joint"))
+    assert max(difference.gradient, difference.weight) < 1e-9, difference.tensor
 
 
 def test_the_comparison_sees_a_wrong_scale_and_a_stale_weight(truth: dict[str, torch.Tensor]) -> None:
@@ -200,17 +210,29 @@ def test_one_process_is_continued_sharded(root: Path, reference: Path, engine: s
 @pytest.mark.parametrize("train", ["full", "adapters"])
 def test_zero_gradients_in_float32(engine: str, train: str, truth: dict[str, torch.Tensor], tmp_path: Path) -> None:
     """DeepSpeed's master weights are float32: as near as DDP in float32, not nearer."""
-    own = truth if train == "full" else measured("ddp", 1, "float64", tmp_path, "--trainable", train)
-    difference = compare(own, measured(engine, 2, "float32", tmp_path, "--trainable", train))
+    own = truth if train == "full" else measured("ddp", 1, "float64", tmp_path, "--train", train)
+    difference = compare(own, measured(engine, 2, "float32", tmp_path, "--train", train))
     assert difference.gradient < 1e-4, difference.tensor
     assert difference.weight < 1e-5
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("engine", ["zero1", "zero2", "zero3"])
+def test_joint_training_under_zero(engine: str, joint_truth: dict[str, torch.Tensor], tmp_path: Path) -> None:
+    difference = compare(joint_truth, measured(engine, 2, "float32", tmp_path, "--passes", "joint"))
+    assert difference.gradient < 1e-4, difference.tensor
+    assert difference.weight < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("passes", ["group", "joint"])
 @pytest.mark.parametrize("engine", ["fsdp2", "zero2", "zero3"])
-def test_chunks_under_every_engine(engine: str, truth: dict[str, torch.Tensor], tmp_path: Path) -> None:
+def test_chunks_under_every_engine(
+    engine: str, passes: str, truth: dict[str, torch.Tensor], joint_truth: dict[str, torch.Tensor], tmp_path: Path
+) -> None:
     dtype = "float64" if engine == "fsdp2" else "float32"
-    difference = compare(truth, measured(engine, 2, dtype, tmp_path, "--encode_chunk", "5"))
+    own = truth if passes == "group" else joint_truth
+    difference = compare(own, measured(engine, 2, dtype, tmp_path, "--encode_chunk", "5", "--passes", passes))
     assert difference.gradient < (1e-9 if dtype == "float64" else 1e-4), difference.tensor
 
 

@@ -12,9 +12,9 @@ from processes import run_ranks
 from torch.nn.parallel import DistributedDataParallel
 
 from pipeline import distributed
-from pipeline.benchmark.cost import ROUNDS, StepSizes, collectives, engine_wire, forward_flops, step_sizes, table
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig
 from pipeline.model.vpr import build_model
+from pipeline.training.cost import ROUNDS, StepSizes, collectives, engine_wire, forward_flops, step_sizes, table
 from pipeline.training.loss import MultiSimilarityLoss
 
 SMALL = ModelConfig(
@@ -29,7 +29,7 @@ VIT_B = StepSizes(
 )  # fmt: skip
 
 
-def counted() -> dict[str, int]:
+def counted(joint: bool) -> dict[str, int]:
     """Bytes on the large side of every collective of one training step on this rank."""
     found = dict.fromkeys(ROUNDS, 0)
 
@@ -56,18 +56,18 @@ def counted() -> dict[str, int]:
     distributed._reduce_scatter = count("reduce_scatter", distributed._reduce_scatter, 1)
     dist.all_reduce = count("all_reduce", dist.all_reduce, 0)
     labels = torch.arange(2 * dist.get_rank(), 2 * dist.get_rank() + 2).repeat_interleave(4)
-    loss_function(module(torch.randn(8, 3, 56, 56)), labels).backward()
+    loss_function(module(torch.randn(8, 3, 56, 56), joint=joint), labels).backward()
     distributed.agree()
     return found
 
 
-@pytest.mark.parametrize("world", [2, 4])
-def test_bytes_of_a_step_are_those_of_the_model(world: int) -> None:
-    sizes = step_sizes(build_model(SMALL, 56), images=8)
+@pytest.mark.parametrize(("world", "passes"), [(2, 1), (4, 1), (2, 2)])
+def test_bytes_of_a_step_are_those_of_the_model(world: int, passes: int) -> None:
+    sizes = step_sizes(build_model(SMALL, 56), images=8, passes=passes)
     wanted = dict.fromkeys(ROUNDS, 0)
     for collective in collectives(sizes, world):
         wanted[collective.kind] += collective.nbytes
-    for found in run_ranks(counted, world):
+    for found in run_ranks(counted, world, passes == 2):
         assert found == wanted
 
 
@@ -95,6 +95,9 @@ def test_table_and_engines() -> None:
     assert len(rows) == 3
     assert rows[0][:3] == ["1", "288", "0.0"]
     assert collectives(VIT_B, 1) == []
+    once, twice = forward_flops(VIT_B, 2), forward_flops(replace(VIT_B, passes=2), 2)
+    assert twice["backbone"] == once["backbone"]  # joint training: one pass of the backbone, 1 % more in all
+    assert 1 < sum(twice.values()) / sum(once.values()) < 1.02
     half = replace(VIT_B, key_bytes=2)
     assert collectives(half, 2)[0].nbytes * 2 == collectives(VIT_B, 2)[0].nbytes
     # sharded parameters travel whole, frozen ones too: five times the bytes of DDP's gradients at ViT-B with adapters

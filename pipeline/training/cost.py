@@ -10,16 +10,13 @@ Shapes: b images on a rank, B = b W in the global batch, R regions, D channels, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-
-import torch
+from dataclasses import dataclass
 
 from pipeline.common.errors import UsageError
 from pipeline.common.text import Table
-from pipeline.config import ModelConfig
 from pipeline.model.backbones.transformer import Backbone
 from pipeline.model.batch_norm import GlobalBatchNorm2d
-from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
+from pipeline.model.vpr import PlaceModel, parameter_counts
 
 ROUNDS = {"all_gather": 1, "reduce_scatter": 1, "all_reduce": 2}
 
@@ -35,6 +32,7 @@ class StepSizes:
         norms: channels of each BatchNorm.
         trained, total: parameters.
         key_bytes: of a gathered key or value: 4, or 2 under bf16 autocast.
+        passes: descriptions of an image: 1, or 2 in joint training, of which the second needs no other image.
     """
 
     images: int
@@ -48,9 +46,10 @@ class StepSizes:
     trained: int
     total: int
     key_bytes: int = 4
+    passes: int = 1
 
 
-def step_sizes(model: PlaceModel, images: int, key_bytes: int = 4) -> StepSizes:
+def step_sizes(model: PlaceModel, images: int, key_bytes: int = 4, passes: int = 1) -> StepSizes:
     """Sizes of a step of this model with b = `images` on a rank; the model may be on the meta device.
 
     Raises:
@@ -72,6 +71,7 @@ def step_sizes(model: PlaceModel, images: int, key_bytes: int = 4) -> StepSizes:
         trained=counts["trainable"],
         total=counts["total"],
         key_bytes=key_bytes,
+        passes=passes,
     )
 
 
@@ -100,18 +100,18 @@ def collectives(sizes: StepSizes, w: int) -> list[Collective]:
         return []
     everyone = sizes.images * w
     keys = sizes.layers * everyone * sizes.regions * 2 * sizes.dim * sizes.key_bytes
-    descriptors = everyone * sizes.regions * sizes.dim * 4
+    descriptors = sizes.passes * everyone * sizes.regions * sizes.dim * 4
     channels = sum(sizes.norms)
     return [
         Collective("keys and values", "all_gather", keys),
         Collective("keys and values", "reduce_scatter", keys),
         Collective("descriptors", "all_gather", descriptors),
         Collective("descriptors", "reduce_scatter", descriptors),
-        Collective("labels", "all_gather", everyone * 8),
+        Collective("labels", "all_gather", sizes.passes * everyone * 8),
         Collective("BatchNorm", "all_gather", w * 4 * (2 * channels + len(sizes.norms))),
         Collective("BatchNorm", "all_reduce", 4 * 2 * channels),
         Collective("gradients", "all_reduce", 4 * sizes.trained),
-        Collective("loss and stop flag", "all_reduce", 4 * 4 + 8),
+        Collective("loss and stop flag", "all_reduce", 4 * (3 + sizes.passes) + 8),
     ]
 
 
@@ -134,13 +134,15 @@ def forward_flops(sizes: StepSizes, w: int) -> dict[str, float]:
     """
     b, everyone, row = sizes.images, sizes.images * w, sizes.regions * sizes.dim
     block = 24 * sizes.tokens * sizes.dim**2 + 4 * sizes.tokens**2 * sizes.dim
-    dense = sizes.layers * sizes.regions * (8 * sizes.dim**2 + 4 * sizes.dim * sizes.feedforward)
-    pairs = (4 * sizes.layers + 2) * row
+    forward, square = 4 * sizes.dim * sizes.feedforward, sizes.dim**2
+    dense = sizes.layers * sizes.regions * (8 * square + forward)
+    alone = (sizes.passes - 1) * sizes.layers * sizes.regions * (4 * square + forward)  # values, no queries nor keys
+    pairs = (4 * sizes.layers + 2 * sizes.passes**2) * row
     return {
         "backbone": float(b * sizes.depth * block),
-        "encoder, per image": float(b * dense),
+        "encoder, per image": float(b * (dense + alone)),
         "own rows": float(pairs * b * everyone),
-        "redundant": float((everyone - b) * (dense + pairs * everyone)),
+        "redundant": float((everyone - b) * (dense + alone + pairs * everyone)),
     }
 
 
@@ -165,17 +167,3 @@ def table(sizes: StepSizes, worlds: Sequence[int]) -> Table:
             + [f"{flops[part] / 1e9:,.0f}" for part in ("backbone", "own rows", "redundant")]
         )
     return Table(head, rows, left=())
-
-
-def tables(
-    config: ModelConfig, image_size: int, places_per_rank: int, worlds: Sequence[int], key_bytes: int = 4
-) -> tuple[Table, Table]:
-    """Of a model: the parts of a step; MB received for parameters and gradients under each engine, float32.
-
-    The model is built of shapes alone: no memory, and no weights file.
-    """
-    with torch.device("meta"):
-        model = build_model(replace(config, backbone=replace(config.backbone, weights=None)), image_size)
-    sizes = step_sizes(model, 4 * places_per_rank, key_bytes)
-    rows = [[str(w), *(f"{engine_wire(e, sizes, w) / 1e6:,.0f}" for e in ("ddp", "fsdp2"))] for w in worlds]
-    return table(sizes, worlds), Table(["W", "ddp, zero1, zero2", "fsdp2, zero3"], rows, left=())
