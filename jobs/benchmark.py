@@ -1,90 +1,308 @@
-"""How fast are the parts and the whole here? python -m jobs.benchmark [--size vitb] [--full]
+"""What the parts of the system cost on this machine.
 
-Everything is compared within this run, way against way in turn, because machines differ and are busy. `--memory` counts
-and measures the memory of a step against the batch, `--precision` the errors of half precision; both instead of times.
+    python -m jobs.benchmark step                     the training step and inference, at the demo's size
+    python -m jobs.benchmark step --size vitb --full  the paper's model, more rounds, torch.compile
+    python -m jobs.benchmark cost --config jobs/configs/cricavpr.yaml
+
+Times are compared within one run, way against way in turn, because machines differ and are busy. Nothing here needs
+data or weights; what is measured is made.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
-from jobs.cli import parse, run_job
+from jobs.cli import parse_part, run_job
 from pipeline.common.errors import UsageError
+from pipeline.config import RunConfig, TrainConfig
 
-MEMORY = {"demo": (72, 288, 1152), "vitb": (8, 32, 288), "tiny": (8, 32)}
+if TYPE_CHECKING:
+    import torch
+
+Name = Literal["demo", "vitb", "tiny"]
+Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
-class BenchmarkJob:
-    """Times, as ratios within one run."""
+class Step:
+    """Times of the training step and of inference: precisions, chunks, the parts of a step."""
 
-    size: Literal["demo", "vitb", "tiny"] = "demo"
-    """Model and images: the demo's (112 px), the paper's (ViT-B/14, 224 px), or one that proves that it runs."""
-    parts: tuple[Literal["data", "step", "ranks"], ...] = ("data", "step", "ranks")
-    """What is timed: reading of images, the training step and inference, the work of several ranks."""
+    size: Name = "demo"
+    """Model and images: the demo's (112 px), the paper's (ViT-B/14, 224 px), or one that only shows that it runs."""
     full: bool = False
     """More rounds and images, and torch.compile; minutes instead of one."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: Device = "auto"
     """Where steps are computed; auto takes a GPU where there is one."""
-    memory: bool = False
-    """Print the memory of a step against the batch instead."""
-    memory_limit_gb: float = 6.0
-    """memory: steps whose counted peak stays below (in 10^9 bytes) are also run, in fresh processes, on the CPU."""
-    precision: bool = False
-    """Print the errors of float32, bf16 and fp16 against float64 instead."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Bytes of a training step against the number of images, with and without chunks."""
+
+    size: Name = "demo"
+    """Model and images, as in `step`."""
+    limit_gb: float = 6.0
+    """Steps whose counted peak stays below (in 10^9 bytes) are also run, in fresh processes, on the CPU."""
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Errors of float32, bf16 and fp16 against float64, in descriptors, loss and gradients."""
+
+    size: Name = "demo"
+    """Model and images, as in `step`."""
+    device: Device = "auto"
+    """Where it is computed; auto takes a GPU where there is one."""
+
+
+@dataclass(frozen=True)
+class Data:
+    """Times of reading images: decoding, augmentation, shards against plain files, the loader's workers."""
+
+    size: Name = "demo"
+    """Whose image size is made."""
+    full: bool = False
+    """More rounds and images."""
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """Times of attention and loss over several ranks: own queries and rows against everything on every rank."""
+
+    size: Name = "demo"
+    """Model, as in `step`."""
+    full: bool = False
+    """More rounds and images."""
+
+
+@dataclass(frozen=True)
+class Engines:
+    """Differences of every engine (DDP, FSDP2, ZeRO) from one process in float64, gradients and weights.
+
+    Launches each engine for three SGD steps of a small model and prints the largest relative difference of any
+    tensor's averaged gradient, and of the weights after the steps. On CPU or GPUs, whichever `accelerate launch` finds;
+    minutes on two cores.
+    """
+
+    engines: tuple[str, ...] = ("ddp", "fsdp2", "zero1", "zero2", "zero3")
+    """Names of files in jobs/accelerate."""
+    processes: int = 2
+    """Ranks of each launch."""
+    trainable: Literal["adapters", "full", "frozen", "last"] = "full"
+    """What of the backbone is trained."""
+    encode_chunk: int | None = None
+    """Images encoded at a time, as train.encode_chunk; none: all at once."""
+    passes: Literal["group", "joint"] = "group"
+    """How often an image is described, as train.passes."""
+
+
+@dataclass(frozen=True)
+class Cost(RunConfig):
+    """Bytes and operations of a step on one rank as the number of ranks W grows, modelled for any config.
+
+    Prints a table for W = 1 ... 64 at a fixed number of places a rank (the global batch grows with W): bytes received
+    in each part of the step, gathered keys and values kept, operations of the forward pass; then what each engine adds
+    for parameters and gradients. A test counts the modelled bytes on real ranks. Needs no weights file.
+    """
+
+    places_per_rank: int = 72
+    """Places on each rank; four images each."""
+    worlds: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
+    """Numbers of ranks."""
+    bf16: bool = False
+    """Under bf16 autocast: keys and values travel in two bytes."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """Recall against exact, bytes and seconds of approximate search, or of PCA where `pca` is given.
+
+        python -m jobs.benchmark search                          100,000 x 256, made of clusters
+        python -m jobs.benchmark search --store outputs/RUN/evaluation/descriptors/SET/single
+        python -m jobs.benchmark search --pca 4096 --rows 16384 --dim 10752    PCA instead
+
+    Each measurement runs in a process of its own, so that its peak memory is its own.
+    """
+
+    rows: int = 100_000
+    """Database descriptors."""
+    dim: int = 256
+    """Numbers a descriptor."""
+    queries: int = 1_000
+    """Queries; of a store all of its own."""
+    recalls: tuple[int, ...] = (1, 10)
+    """Neighbours looked at: percent of the exact ones that were also found."""
+    kinds: tuple[Literal["exact", "hnsw", "ivfpq"], ...] = ("exact", "hnsw", "ivfpq")
+    """What is measured."""
+    store: str | None = None
+    """A folder of stored descriptors (it holds database/ and queries/) instead of made ones."""
+    pca: int | None = None
+    """Measure PCA to so many dimensions instead of search."""
+    sklearn: bool = False
+    """Measure scikit-learn's PCA beside ours."""
+    timeout: float = 600.0
+    """Seconds after which one measurement is given up, and said so."""
+    seed: int = 0
+    """Of the made descriptors."""
+
+
+@dataclass(frozen=True)
+class Store:
+    """Peak memory and seconds of a descriptor store at size: writing, reading, search, PCA and recalls from it.
+
+        python -m jobs.benchmark store                           64 and 1,344 dimensions, each at N and at 4 N rows
+        python -m jobs.benchmark store --sizes 20000x10752,80000x10752 --dims 4096 --folder /large/disk
+
+    Made descriptors, in a store as an evaluation writes it. Every step runs in a process of its own. What does not grow
+    from N to 4 N rows does not depend on them.
+    """
+
+    sizes: tuple[str, ...] = ("500000x64", "2000000x64", "60000x1344", "240000x1344")
+    """Rows x dimensions of the database."""
+    queries: int = 64
+    """Queries, each another view of a known row."""
+    stored: Literal["fp32", "fp16"] = "fp16"
+    """Type of the stored descriptors."""
+    dims: int = 32
+    """Dimensions that PCA keeps."""
+    recall: int = 10
+    """Neighbours searched."""
+    folder: str | None = None
+    """Where the store is written and removed again; none: the temporary folder."""
+    timeout: float = 1800.0
+    """Seconds after which a step is given up, and said so."""
 
 
 def main() -> None:
     """Parses, measures, prints."""
-    job = parse(BenchmarkJob, __doc__ or "", config_file=False)
+    part, job = parse_part({name: kind for name, (kind, _) in PARTS.items()}, __doc__ or "")
+    try:
+        PARTS[part][1](job)
+    except ModuleNotFoundError as error:
+        raise UsageError(f"{part} needs {error.name}, which is not installed here") from error
+
+
+def step(job: Step) -> None:
+    """Prints the machine, then the comparisons."""
+    from pipeline.benchmark import step, timing
+    from pipeline.benchmark.sizes import SIZES
+
+    size, device = SIZES[job.size], _device(job.device)
+    images = (size.images_gpu if device.type == "cuda" else size.images) * (2 if job.full else 1)
+    print(timing.show(step.measure(size, device, _rounds(job.full), images, job.full)))
+
+
+def memory(job: Memory) -> None:
+    """Prints the machine, then the table."""
+    from pipeline.benchmark import memory
+
+    _device("cpu")
+    print(memory.measure(job.size, job.limit_gb * 1e9))
+
+
+def precision(job: Precision) -> None:
+    """Prints the machine, then the table."""
+    from pipeline.benchmark import precision
+    from pipeline.benchmark.sizes import SIZES
+
+    size, device = SIZES[job.size], _device(job.device)
+    images = min(size.images_gpu if device.type == "cuda" else size.images, 32)
+    print(precision.show(precision.compare(size, images, device)))
+
+
+def data(job: Data) -> None:
+    """Prints the machine, then the comparisons."""
+    from pipeline.benchmark import data, timing
+    from pipeline.benchmark.sizes import SIZES
+
+    _device("cpu")
+    print(timing.show(data.measure(_rounds(job.full), 64 if job.full else 24, SIZES[job.size].image_size)))
+
+
+def ranks(job: Ranks) -> None:
+    """Prints the machine, then the comparisons."""
+    from pipeline.benchmark import ranks, timing
+    from pipeline.benchmark.sizes import SIZES
+
+    _device("auto")
+    print(timing.show(ranks.measure(SIZES[job.size], _rounds(job.full), 288 if job.full else 64)))
+
+
+def engines(job: Engines) -> None:
+    """Prints a line an engine."""
+    from pipeline.benchmark import engines
+
+    configs = Path(__file__).parent / "accelerate"
+    config = TrainConfig(encode_chunk=job.encode_chunk, passes=job.passes)
+    for line in engines.differences(configs, job.engines, job.processes, job.trainable, config):
+        print(line, flush=True)
+
+
+def cost(job: Cost) -> None:
+    """Prints both tables."""
+    from pipeline.benchmark import cost
+
+    key_bytes, passes = 2 if job.bf16 else 4, 2 if job.train.passes == "joint" else 1
+    parts, engines = cost.tables(job.model, job.data.image_size, job.places_per_rank, job.worlds, key_bytes, passes)
+    parts.print()
+    print("\nMB received for parameters and gradients, float32:\n")
+    engines.print()
+
+
+def search(job: Search) -> None:
+    """Prints a line a measurement."""
+    from pipeline.benchmark import search
+
+    if job.pca:
+        lines = search.projections(job.rows, job.dim, job.pca, job.sklearn, job.timeout, job.seed)
+    else:
+        lines = search.searches(
+            job.store, job.rows, job.dim, job.queries, job.kinds, job.recalls, job.timeout, job.seed
+        )
+    for line in lines:
+        print(line, flush=True)
+
+
+def store(job: Store) -> None:
+    """Prints a line a step."""
+    from pipeline.benchmark import store
+
+    sizes = [store.parse_size(text) for text in job.sizes]
+    for line in store.measure(sizes, job.queries, job.stored, job.dims, job.recall, job.folder, job.timeout):
+        print(line, flush=True)
+
+
+PARTS: dict[str, tuple[type, Callable[[Any], None]]] = {
+    "step": (Step, step),
+    "memory": (Memory, memory),
+    "precision": (Precision, precision),
+    "data": (Data, data),
+    "ranks": (Ranks, ranks),
+    "engines": (Engines, engines),
+    "cost": (Cost, cost),
+    "search": (Search, search),
+    "store": (Store, store),
+}
+
+
+def _rounds(full: bool) -> int:
+    return 9 if full else 3
+
+
+def _device(wanted: Device) -> torch.device:
+    """Where to compute; prints what the figures were measured on. Raises `UsageError`."""
     import torch
 
     from pipeline.benchmark import timing
-    from pipeline.benchmark.sizes import SIZES
 
-    if job.device == "cuda" and not torch.cuda.is_available():
-        raise UsageError("device cuda: there is no GPU that torch can use here; leave device out")
-    device = torch.device("cuda" if torch.cuda.is_available() and job.device != "cpu" else "cpu")
-    size = SIZES[job.size]
-    images = size.images_gpu if device.type == "cuda" else size.images
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise UsageError("--device cuda: there is no GPU that torch can use here; leave --device out")
+    device = torch.device("cuda" if torch.cuda.is_available() and wanted != "cpu" else "cpu")
     print(timing.machine(device), flush=True)
-    if job.memory:
-        from pipeline.benchmark import memory
-
-        print(memory.measure(job.size, MEMORY[job.size], job.memory_limit_gb * 1e9))
-    elif job.precision:
-        from pipeline.benchmark import precision
-
-        print(precision.show(precision.compare(size, min(images, 32), device)))
-    else:
-        print(timing.show(times(job, device, images)))
-
-
-def times(job: BenchmarkJob, device: Any, images: int) -> list[Any]:
-    """The comparisons that were asked for; a part whose packages are not installed is left out, and said."""
-    import importlib
-    import sys
-
-    from pipeline.benchmark.sizes import SIZES
-
-    size = SIZES[job.size]
-    rounds = 9 if job.full else 3
-    work = {
-        "data": lambda part: part.measure(rounds, 64 if job.full else 24, size.image_size),
-        "step": lambda part: part.measure(size, device, rounds, images * (2 if job.full else 1), job.full),
-        "ranks": lambda part: part.measure(size, rounds, 288 if job.full else 64),
-    }
-    found = []
-    for name in job.parts:
-        module = {"data": "reading"}.get(name, name)
-        try:
-            part = importlib.import_module(f"pipeline.benchmark.{module}")
-        except ModuleNotFoundError as error:
-            print(f"{name}: left out, {error.name} is not installed here", file=sys.stderr)
-            continue
-        found += work[name](part)
-    return found
+    return device
 
 
 if __name__ == "__main__":

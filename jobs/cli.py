@@ -1,57 +1,117 @@
 """One way to start a job: typed dataclass -> YAML file + command-line overrides, errors as one line, exit codes.
 
-jsonargparse was chosen over tyro after trying both on `RunConfig`: both show `--help` in about 0.25 s, but
-jsonargparse reads `--config FILE` and then overrides in order, with the file's keys checked against the types,
-where tyro needs the file parsed and turned into a default first.
+jsonargparse reads `--config FILE` and then the options in order, and checks both against the types. The list of options
+and `--help` are made here, from the dataclass alone, so that `--help` needs none of it. An option's name is its YAML
+key, `--data.places_per_batch`; dashes are read as underscores.
 
-Exit codes: 0 done, 2 usage or configuration, 3 data, 4 diverged, 75 preempted and saved (`pipeline.common.errors`).
+Exit codes: 0 done, 2 usage or configuration, 3 data, 4 diverged, 75 preempted and saved (`pipeline.common.errors`),
+130 interrupted.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
+import inspect
 import json
 import os
 import re
+import shutil
 import sys
+import textwrap
+import types
 import typing
-from collections.abc import Callable, Sequence
-from typing import Any, NoReturn, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NoReturn, TypeVar
 
 from pipeline.common.errors import UsageError, UserError
+from pipeline.config import RunConfig
 
 Config = TypeVar("Config")
 
 
-def parse(kind: type[Config], description: str, argv: Sequence[str] | None = None, config_file: bool = True) -> Config:
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """One option of a job.
+
+    Attributes:
+        name: `data.places_per_batch`, without the two dashes.
+        hint: its type.
+        default: its value where neither file nor command line gives one.
+        doc: what it means.
+        group: the heading that it stands under in `--help`.
+    """
+
+    name: str
+    hint: Any
+    default: Any
+    doc: str
+    group: str
+
+
+def parse(
+    kind: type[Config],
+    description: str,
+    argv: Sequence[str] | None = None,
+    config_file: bool = True,
+    program: str | None = None,
+) -> Config:
     """Parses the command line into the frozen dataclass `kind`.
 
     Args:
         kind: the dataclass; nested dataclasses become dotted options.
-        description: first lines of `--help`.
-        argv: arguments, `sys.argv[1:]` by default. Dashes in option names are underscores; a bool field is a
-            switch; a tuple may be given as `a,b`.
+        description: first lines of `--help`; indented lines are examples and stay as they are.
+        argv: arguments, `sys.argv[1:]` by default. A bool field is a switch; a tuple may be given as `a,b`.
         config_file: whether `--config FILE` (YAML) is accepted; later options override it.
+        program: name in the usage line; none: that of the job.
 
     Raises:
         UsageError: an unknown key (with the nearest known one), a value of the wrong type, a missing file.
+        SystemExit: after `--help`.
     """
-    from jsonargparse import ArgumentParser, set_parsing_settings
-
-    set_parsing_settings(docstring_parse_attribute_docstrings=True)
+    words = list(sys.argv[1:] if argv is None else argv)
+    known = options(kind)
+    if "-h" in words or "--help" in words:
+        print(help_text(program or program_name(), description, known, config_file))
+        raise SystemExit(0)
+    words = _normalise(words, {o.name: o.hint for o in known}, _groups(kind) | ({"config"} if config_file else set()))
+    from jsonargparse import ArgumentParser
 
     class Parser(ArgumentParser):
         def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-            raise UsageError(_readable(message, known))
+            raise UsageError(_readable(message, [o.name for o in known]))
 
-    parser = Parser(description=description, prog=_program(), default_env=False)
+    parser = Parser(prog=program_name(), default_env=False, add_help=False)
     if config_file:
-        parser.add_argument("--config", action="config", help="YAML file; options after it override its values")
+        parser.add_argument("--config", action="config")
     parser.add_class_arguments(kind, as_group=True)
-    known = [o[2:] for action in parser._actions for o in action.option_strings if o.startswith("--")]
-    values = parser.parse_args(_normalise(sys.argv[1:] if argv is None else argv, parser))
-    built = parser.instantiate(values)
+    built = parser.instantiate(parser.parse_args(words))
     return kind(**{key: value for key, value in vars(built).items() if key != "config"})
+
+
+def parse_part(parts: Mapping[str, type], description: str, argv: Sequence[str] | None = None) -> tuple[str, Any]:
+    """The first word, which is one of `parts`, and the rest of the command line parsed as that part's dataclass.
+
+    Raises:
+        UsageError: no such part, or as `parse`; SystemExit: after `--help`.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not words or words[0] in ("-h", "--help"):
+        told = "\n".join(f"  {name:<12}{(kind.__doc__ or '').splitlines()[0]}" for name, kind in parts.items())
+        print(f"usage: {_command(program_name())} PART [options]\n\n{description.strip()}\n\nparts:\n{told}")
+        print(f"\n{_command(program_name())} PART --help tells a part's options")
+        raise SystemExit(0 if words else 2)
+    name = words[0]
+    if name not in parts:
+        near = difflib.get_close_matches(name, parts, n=1)
+        raise UsageError(
+            f"no part '{name}'" + (f" (did you mean '{near[0]}'?)" if near else "") + f"; parts are {', '.join(parts)}"
+        )
+    kind = parts[name]
+    return name, parse(
+        kind, inspect.getdoc(kind) or "", words[1:], issubclass(kind, RunConfig), f"{program_name()} {name}"
+    )
 
 
 def run_job(main: Callable[[], Any]) -> NoReturn:
@@ -60,10 +120,10 @@ def run_job(main: Callable[[], Any]) -> NoReturn:
         main()
         code = 0
     except UserError as error:
-        print(f"{_program()}: {error}", file=sys.stderr)
+        print(f"{program_name()}: {error}", file=sys.stderr)
         code = error.exit_code
     except KeyboardInterrupt:
-        print(f"{_program()}: interrupted", file=sys.stderr)
+        print(f"{program_name()}: interrupted", file=sys.stderr)
         code = 130
     except BrokenPipeError:  # the reader (head, less) has left; that is not our failure
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -71,43 +131,158 @@ def run_job(main: Callable[[], Any]) -> NoReturn:
     sys.exit(code)
 
 
-def _program() -> str:
+def options(kind: type, values: Any = None, prefix: str = "", group: str = "") -> list[Option]:
+    """The options of a dataclass as `--help` orders them: the job's own, the inherited, those of nested dataclasses."""
+    values = kind() if values is None else values
+    hints = typing.get_type_hints(kind)
+    documented: dict[str, str] = {}
+    classes: dict[str, type] = {}
+    for base in reversed(kind.__mro__):
+        if dataclasses.is_dataclass(base):
+            documented |= _docs(base)
+            classes |= dict.fromkeys(vars(base).get("__annotations__", {}), base)
+    own: list[Option] = []
+    inherited: list[Option] = []
+    nested: list[Option] = []
+    for field in dataclasses.fields(kind):
+        value, doc = getattr(values, field.name), documented.get(field.name, "")
+        name = prefix + field.name
+        if dataclasses.is_dataclass(hints[field.name]):
+            nested += options(hints[field.name], value, f"{name}.", f"{name}: {doc}")
+        elif classes[field.name] is kind or prefix:
+            own.append(Option(name, hints[field.name], value, doc, group))
+        else:
+            heading = (classes[field.name].__doc__ or "").split(". ")[0].split(".\n")[0].strip().rstrip(".")
+            inherited.append(Option(name, hints[field.name], value, doc, heading))
+    return own + inherited + nested
+
+
+def help_text(program: str, description: str, known: Sequence[Option], config_file: bool) -> str:
+    """The text of `--help`: what the job does, examples, then the options in groups, most wanted first."""
+    lines = [f"usage: {_command(program)} {'[--config FILE] ' if config_file else ''}[options]", ""]
+    lines += [description.strip(), "", "options:"]
+    width = min(110, shutil.get_terminal_size((100, 24)).columns)
+    if config_file:
+        lines += _entry("--config FILE", "YAML file of these settings; options after it override its values.", width)
+    group = ""
+    for option in known:
+        if option.group != group:
+            group = option.group
+            lines += ["", *textwrap.wrap(group, width)]
+        default = _shown(option.default)
+        value = _metavar(option.hint)
+        doc = option.doc + ("" if default is None else f" (default: {default})")
+        if len(value) > width - 30:
+            value, doc = "NAME", f"{doc} One of {value.strip('{}').replace(',', ', ')}."
+        lines += _entry(f"--{option.name} {value}".rstrip(), doc, width)
+    return "\n".join(lines)
+
+
+def program_name() -> str:
+    """`jobs.train` under `python -m`, `vpr-train` as a console command."""
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
-    return spec.name if spec is not None else sys.argv[0]
+    return spec.name if spec is not None else Path(sys.argv[0]).name
 
 
-def _normalise(argv: Sequence[str], parser: Any) -> list[str]:
-    """`--max-bad` for `--max_bad`; a switch without a value, `--dry-run`; `--sets a,b` for `--sets '["a", "b"]'`."""
-    hints = {option: getattr(a, "_typehint", None) for a in parser._actions for option in a.option_strings}
+def _command(program: str) -> str:
+    return f"python -m {program}" if program.startswith("jobs.") else program
+
+
+def _docs(kind: type) -> dict[str, str]:
+    """Field -> its docstring, of this class alone."""
+    from docstring_parser import parse_from_object
+
+    return {p.arg_name: " ".join((p.description or "").split()) for p in parse_from_object(kind).params}
+
+
+def _groups(kind: type, prefix: str = "") -> set[str]:
+    """Dotted names of the nested dataclasses."""
+    found: set[str] = set()
+    for name, hint in typing.get_type_hints(kind).items():
+        if dataclasses.is_dataclass(hint):
+            found |= {prefix + name} | _groups(typing.cast(type, hint), f"{prefix}{name}.")
+    return found
+
+
+def _entry(left: str, doc: str, width: int) -> list[str]:
+    wrapped = textwrap.wrap(doc, width - 30) or [""]
+    first = [f"  {left}"] if len(left) > 26 else [f"  {left:<27} {wrapped.pop(0)}"]
+    return first + [" " * 30 + line for line in wrapped]
+
+
+def _plain(hint: Any) -> Any:
+    """The type without `| None`."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return next(part for part in typing.get_args(hint) if part is not types.NoneType)
+    return hint
+
+
+def _metavar(hint: Any) -> str:
+    """What stands after an option in `--help`: nothing for a switch, N, X, TEXT, {a,b} or A,B,..."""
+    hint = _plain(hint)
+    if typing.get_origin(hint) is Literal:
+        return "{" + ",".join(map(str, typing.get_args(hint))) + "}"
+    if typing.get_origin(hint) is tuple:
+        inner = _metavar(typing.get_args(hint)[0])
+        return f"{inner},..."
+    return {bool: "", int: "N", float: "X"}.get(hint, "TEXT")
+
+
+def _shown(value: Any) -> str | None:
+    """A default as it would be typed; None where there is nothing to say."""
+    if value is None or value == "" or value == ():
+        return None
+    if isinstance(value, bool):
+        return "on; off with 'false'" if value else None
+    if isinstance(value, tuple):
+        return ",".join(map(str, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _normalise(argv: Sequence[str], hints: Mapping[str, Any], groups: set[str]) -> list[str]:
+    """Pairs of option and value: `--max-bad` becomes `--max_bad`, a switch gets `true`, `a,b` becomes `["a", "b"]`.
+
+    Raises:
+        UsageError: an option that does not exist, or a value without an option.
+    """
     words: list[str] = []
     for word in argv:
-        if word.startswith("--"):
-            if words and hints.get(words[-1]) is bool:
-                words.append("true")
-            name, equals, value = word.partition("=")
-            name = "--" + name[2:].replace("-", "_")
-            words += [name, value] if equals else [name]
-        else:
-            words.append(word)
-        if len(words) > 1 and typing.get_origin(hints.get(words[-2])) is tuple and not words[-1].startswith("["):
-            kinds = typing.get_args(hints[words[-2]])
-            items = [i for i in words[-1].split(",") if i]
-            words[-1] = "[" + ", ".join(items if int in kinds else map(json.dumps, items)) + "]"
-    if words and hints.get(words[-1]) is bool:
+        if not word.startswith("--"):
+            if not words or not words[-1].startswith("--"):
+                raise UsageError(f"'{word}' stands without an option; write --NAME {word}")
+            words.append(_listed(word, hints.get(words[-1][2:])))
+            continue
+        if words and hints.get(words[-1][2:]) is bool:
+            words.append("true")
+        name, equals, value = word[2:].partition("=")
+        name = name.replace("-", "_")
+        if name not in hints and name not in groups:
+            raise UsageError(f"there is no option --{name}{_nearest(name, [*hints, *groups])}")
+        words += [f"--{name}", _listed(value, hints.get(name))] if equals else [f"--{name}"]
+    if words and hints.get(words[-1][2:]) is bool:
         words.append("true")
     return words
 
 
-def _readable(message: str, known: list[str]) -> str:
+def _listed(value: str, hint: Any) -> str:
+    """`a,b` of a tuple option as a YAML list."""
+    if typing.get_origin(hint) is not tuple or value.startswith("["):
+        return value
+    items = [item for item in value.split(",") if item]
+    return "[" + ", ".join(items if int in typing.get_args(hint) else map(json.dumps, items)) + "]"
+
+
+def _nearest(word: str, known: Sequence[str]) -> str:
+    """` (did you mean 'train.lr'?)`, or nothing."""
+    last = word.rsplit(".", 1)[-1]
+    near = [name for name in known if name.rsplit(".", 1)[-1] == last]  # right name, wrong or no section
+    near = near or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    near = near or [n for n in known if difflib.get_close_matches(last, [n.rsplit(".", 1)[-1]], cutoff=0.7)]
+    return f" (did you mean '{near[0]}'?)" if near and near[0] != word else ""
+
+
+def _readable(message: str, known: Sequence[str]) -> str:
     """One line of the parser's message, with the nearest known name where a key is unknown."""
     line = " ".join(message.split())
     unknown = re.search(r"(?:unrecognized arguments: --|[Kk]ey '|option ')([\w.-]+)", line)
-    if unknown:
-        word = unknown.group(1)
-        last = word.rsplit(".", 1)[-1]
-        near = [name for name in known if name.rsplit(".", 1)[-1] == last]  # right name, wrong or no section
-        near = near or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-        near = near or [n for n in known if difflib.get_close_matches(last, [n.rsplit(".", 1)[-1]], cutoff=0.7)]
-        if near and near[0] != word:
-            line += f" (did you mean '{near[0]}'?)"
-    return line
+    return line + (_nearest(unknown.group(1), known) if unknown else "")

@@ -5,7 +5,8 @@
 
 Runs that jobs.evaluate has predictions of are compared query by query with the first of them, or each with each: the
 difference in recall with its 95 % interval (paired bootstrap), called real only where McNemar's exact test agrees.
-Folders of evaluations, also of jobs.stored or of a released model, are compared in this way alone, without MLflow.
+Folders of evaluations, also of stored descriptors or of a released model, are compared in this way alone, without
+MLflow.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class CompareJob:
     runs: tuple[str, ...] = ()
     """Names or MLflow ids, `[a,b]`; none: the newest run of each name."""
     evaluations: tuple[str, ...] = ()
-    """Folders that jobs.evaluate or jobs.stored wrote to, instead of runs; they hold predictions/."""
+    """Folders that jobs.evaluate wrote to, instead of runs; they hold predictions/."""
     pairs: Literal["first", "all"] = "first"
     """Compare query by query with the first, or each with each."""
     experiment: str = "place-recognition"

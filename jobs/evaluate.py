@@ -2,9 +2,13 @@
 
     python -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k,msls_val --root data
     accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k
+    python -m jobs.evaluate --from_store outputs/RUN/evaluation --dimensions 4096,1024,256
 
 Prints one table and writes results.json, results.md, results.csv, predictions/, figures/ and report.html. The number of
 processes changes nothing but the time. Sets that are missing are named and left out; exit code 3 when none is there.
+
+--from_store needs no model, no GPU, and opens no photo: every grouping that an evaluation with --store kept is scored
+again, whole and with each of --dimensions. The sets lie where they lay, since they tell what is correct.
 """
 
 from __future__ import annotations
@@ -33,14 +37,27 @@ class EvaluateJob(EvaluationConfig):
     """Draw figures and the HTML report."""
     timeout: float = 1800.0
     """Seconds that a process waits for the others."""
+    from_store: str | None = None
+    """Score stored descriptors instead of a checkpoint: the folder that an evaluation with --store wrote to."""
+    dimensions: tuple[int, ...] = ()
+    """from_store: PCA dimensions, a row each beside the whole descriptors; fitted on each set's own database."""
+
+
+# what a store's descriptors leave open; all other settings of an evaluation were decided when they were made
+OPEN = ("sets", "root", "split", "recalls", "radius", "frames", "without_positives", "pca_whiten", "search")
 
 
 def main() -> None:
     """Parses, evaluates, reports."""
     job = parse(EvaluateJob, __doc__ or "")
+    config = EvaluationConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(EvaluationConfig)})
+    if job.from_store is not None:
+        stored(job, Path(job.from_store), config)
+        return
+    if job.dimensions:
+        raise UsageError("--dimensions goes with --from_store; with a checkpoint give --pca")
     if not job.checkpoint:
         raise UsageError("--checkpoint is missing: a run folder such as outputs/cricavpr, or a model file")
-    config = EvaluationConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(EvaluationConfig)})
     from pipeline.training.launch import launched
 
     with launched(job.timeout) as accelerator:
@@ -88,6 +105,30 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
         values = {name: value for entry in tables.as_dicts(results) for name, value in entry["metrics"].items()}
         record_evaluation(runs[0], read_metadata(file)["extra"], values, output)
     print(f"\nwritten to {output}/" + (": open report.html in a browser" if job.figures else ""))
+
+
+def stored(job: EvaluateJob, folder: Path, config: EvaluationConfig) -> None:
+    """Scores the descriptors below `folder`, in this process alone."""
+    if job.checkpoint:
+        raise UsageError("give --checkpoint or --from_store, not both")
+    for field in dataclasses.fields(EvaluationConfig):
+        if field.name not in OPEN and getattr(config, field.name) != field.default:
+            raise UsageError(f"--{field.name}: stored descriptors have their own; leave it out, or evaluate again")
+    if any(number < 1 for number in (*job.dimensions, *job.recalls)):
+        raise UsageError("--dimensions and --recalls start at 1")
+    from pipeline.evaluation.describe.stored import evaluate_stores, stored_sets
+    from pipeline.evaluation.predictions import save_results
+    from pipeline.evaluation.report import tables
+    from pipeline.evaluation.sets.load import load_sets
+
+    sets, left_out = load_sets(config.sets or stored_sets(folder), config)
+    for line in left_out:
+        print(f"left out: {line}", file=sys.stderr)
+    results = evaluate_stores(folder, sets, config, (None, *job.dimensions))
+    tables.show(results)
+    output = Path(job.output) if job.output else folder / "from_store"
+    save_results(results, sets, output, {"stores": str(folder), "evaluation": to_dict(config), "left_out": left_out})
+    print(f"\nwritten to {output}/")
 
 
 if __name__ == "__main__":

@@ -38,7 +38,8 @@ def test_every_shown_command_parses(page: str, command: str, monkeypatch: pytest
     for stop in ("|", "&&", ";", ">", "&"):
         arguments = arguments[: arguments.index(stop)] if stop in arguments else arguments
     module = importlib.import_module(name)
-    real = module.parse
+    entry = "parse_part" if hasattr(module, "parse_part") else "parse"
+    real = getattr(module, entry)
 
     def parse(*given: Any, **named: Any) -> Any:
         real(*given, **named)
@@ -46,7 +47,7 @@ def test_every_shown_command_parses(page: str, command: str, monkeypatch: pytest
 
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr("sys.argv", [name, *arguments])
-    monkeypatch.setattr(module, "parse", parse)
+    monkeypatch.setattr(module, entry, parse)
     if "--help" in arguments:
         with pytest.raises(SystemExit):
             module.main()

@@ -94,7 +94,7 @@ def count_fake(size: Size, norm: Norm, images: int, chunk: int | None) -> Bytes:
     with torch.device("meta"):
         model = bare(size, norm)
     with FakeTensorMode(allow_non_fake_inputs=True):
-        model._apply(lambda tensor: torch.empty(tensor.shape, dtype=tensor.dtype, device="cpu"))
+        model.to_empty(device="cpu")
         return count(model, torch.empty(images, 3, size.image_size, size.image_size), chunk)
 
 
@@ -116,18 +116,20 @@ def _resident(name: str, norm: Norm, images: int, chunk: int | None) -> float:
     return before
 
 
-def measure(name: str, batches: tuple[int, ...], limit: float) -> str:
+BATCHES = {"demo": (72, 288, 1152), "vitb": (8, 32, 288), "tiny": (8, 32)}  # images of the steps, by size
+
+
+def measure(name: str, limit: float) -> str:
     """The memory table of a size.
 
     Args:
         name: of the size.
-        batches: images of the steps.
         limit: bytes; a step is also run, in a fresh process, where its counted peak stays below.
     """
     size = SIZES[name]
     lines: list[tuple[str, ...]] = [("", "images", "kept", "peak", "peak an image", "resident, run")]
     for norm, chunk in ((n, c) for n in ("batch", "group") for c in (None, size.memory_chunk)):
-        for images in batches:
+        for images in BATCHES[name]:
             counted = count_fake(size, norm, images, chunk)  # type: ignore[arg-type]
             run = counted.peak < limit
             ran = _mb(resident(name, norm, images, chunk)) if run else "not run"  # type: ignore[arg-type]

@@ -54,8 +54,8 @@ class BothForms:
         same = labels[:, None] == labels[None, :]
         itself = torch.eye(len(labels), dtype=torch.bool, device=labels.device)
         positive, negative = self.loss.mine(similarity.detach(), same & ~itself, ~same)
-        push = self.loss._soft_sum(-self.loss.alpha * (similarity - self.loss.base), positive) / self.loss.alpha
-        pull = self.loss._soft_sum(self.loss.beta * (similarity - self.loss.base), negative) / self.loss.beta
+        push = self.loss.soft_sum(-self.loss.alpha * (similarity - self.loss.base), positive) / self.loss.alpha
+        pull = self.loss.soft_sum(self.loss.beta * (similarity - self.loss.base), negative) / self.loss.beta
         return (push + pull).mean()
 
     def _descriptors(self, regions: Tensor) -> Tensor:

@@ -103,8 +103,8 @@ class MultiSimilarityLoss(nn.Module):
         different = ~same & ~self._near(labels, everyone)
         positive, negative = self.mine(similarity.detach(), same & ~itself, different)
 
-        push = self._soft_sum(-self.alpha * (similarity - self.base), positive) / self.alpha
-        pull = self._soft_sum(self.beta * (similarity - self.base), negative) / self.beta
+        push = self.soft_sum(-self.alpha * (similarity - self.base), positive) / self.alpha
+        pull = self.soft_sum(self.beta * (similarity - self.base), negative) / self.beta
         local = (push + pull).mean()
 
         anchors = (positive.any(1) | negative.any(1)).view(passes, -1).sum(1)
@@ -152,7 +152,7 @@ class MultiSimilarityLoss(nn.Module):
         )
 
     @staticmethod
-    def _soft_sum(exponent: Tensor, mask: Tensor) -> Tensor:
+    def soft_sum(exponent: Tensor, mask: Tensor) -> Tensor:
         """log(1 + sum over the mask of e^exponent) for each row, without overflow: [b, B] -> [b]."""
         exponent = exponent.masked_fill(~mask, -torch.inf)
         return torch.logsumexp(torch.cat([exponent.new_zeros(len(exponent), 1), exponent], dim=1), dim=1)

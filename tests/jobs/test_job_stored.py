@@ -1,4 +1,4 @@
-"""`jobs.stored` as a person starts it: recalls and PCA tables from descriptors, model and pictures gone."""
+"""`jobs.evaluate --from_store` as a person starts it: recalls and PCA tables, model and pictures gone."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def plainly(home: Path, grouping: str, dims: int | None, radius: float) -> dict[
 def test_dimensions_and_radius_from_the_store_alone(home: Path, radius: float) -> None:
     out = home / f"radius {radius}"
     options = ["--dimensions", "8,2,1", "--recalls", "1,3", "--radius", str(radius), "--output", str(out)]
-    stores = ["--stores", str(home / "run" / "evaluation"), "--root", str(home / "data")]
-    text = finished("jobs.stored", home / "log", *stores, *options)
+    stores = ["--from_store", str(home / "run" / "evaluation"), "--root", str(home / "data")]
+    text = finished("jobs.evaluate", home / "log", *stores, *options)
     assert "single_pca2" in text and "ordered4_pca8" in text
     results = json.loads((out / "results.json").read_text())["results"]
     assert len(results) == 8
@@ -77,17 +77,19 @@ def test_dimensions_and_radius_from_the_store_alone(home: Path, radius: float) -
 
 
 def test_what_is_missing_is_one_line(home: Path) -> None:
-    stores = ("--stores", str(home / "run" / "evaluation"), "--root", str(home / "data"))
+    stores = ("--from_store", str(home / "run" / "evaluation"), "--root", str(home / "data"))
     cases = [
-        ((), 2, "--stores is missing"),
-        (("--stores", str(home / "data")), 3, "no descriptors/ in it"),
+        (("--dimensions", "8"), 2, "--dimensions goes with --from_store"),
+        ((*stores, "--group-size", "8"), 2, "--group_size: stored descriptors have their own"),
+        ((*stores, "--checkpoint", str(home)), 2, "not both"),
+        (("--from_store", str(home / "data")), 3, "no descriptors/ in it"),
         ((*stores, "--sets", "pitts30k"), 3, "pitts30k"),
         ((*stores, "--dimensions", "25"), 2, "PCA to 25 dimensions needs at least as many images"),
         ((*stores, "--dimensions", "0"), 2, "start at 1"),
     ]
     for options, code, message in cases:
-        assert message in finished("jobs.stored", home / "log", *options, code=code)
+        assert message in finished("jobs.evaluate", home / "log", *options, code=code)
     (home / "data/town/images/test/database").rename(home / "aside")
     shutil.copytree(home / "aside", home / "data/town/images/test/database", dirs_exist_ok=True)
     next((home / "data/town/images/test/database").glob("*.jpg")).unlink()
-    assert "holds other images than town has now" in finished("jobs.stored", home / "log", *stores, code=3)
+    assert "holds other images than town has now" in finished("jobs.evaluate", home / "log", *stores, code=3)

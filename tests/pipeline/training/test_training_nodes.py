@@ -18,8 +18,8 @@ from processes import free_port
 from safetensors.torch import load_file
 from tiny import prepare, run_settings
 
+from pipeline.benchmark.engines import compare
 from pipeline.data.plan import plan
-from pipeline.training.engine_parity import compare
 from shards.index import read_index
 
 LAUNCHER = [sys.executable, "-m", "accelerate.commands.accelerate_cli", "launch"]
@@ -58,8 +58,8 @@ def machines(job: list[str], folder: Path) -> list[subprocess.Popen[str]]:
 @pytest.mark.slow
 def test_two_machines_have_the_gradients_of_one_process(tmp_path: Path) -> None:
     truth, found = tmp_path / "truth.safetensors", tmp_path / "found.safetensors"
-    Launched("ddp", 1, "jobs.engines", ["--write", str(truth)], truth).done()
-    for process in machines(["jobs.engines", "--write", str(found)], tmp_path):
+    Launched("ddp", 1, "pipeline.benchmark.engines", ["--write", str(truth)], truth).done()
+    for process in machines(["pipeline.benchmark.engines", "--write", str(found)], tmp_path):
         assert process.wait(600) == 0, (tmp_path / "machine0.log").read_text()[-3000:]
     difference = compare(load_file(truth), load_file(found))
     assert difference.gradient < 1e-9

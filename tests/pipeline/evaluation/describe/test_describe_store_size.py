@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.benchmark.own_process import alone
-from pipeline.benchmark.store_size import Numbered, find, fit, project, protocol, read, recalls, write
+from pipeline.benchmark.store import Numbered, find, fit, project, protocol, read, recalls, write
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.describe.store import DescriptorStore
 from pipeline.evaluation.describe.stored import evaluate_stores

@@ -16,10 +16,10 @@ from launched import ENGINES, Launched
 from safetensors.torch import load_file
 from tiny import prepare, run_settings
 
+from pipeline.benchmark.engines import compare
 from pipeline.common.errors import UsageError
 from pipeline.config import TrainConfig
 from pipeline.model.weights.files import load_model
-from pipeline.training.engine_parity import compare
 from pipeline.training.engines.build import choose
 from pipeline.training.engines.zero import zero_settings
 
@@ -43,7 +43,9 @@ def joint_truth(tmp_path_factory: pytest.TempPathFactory) -> dict[str, torch.Ten
 
 def measured(engine: str, world: int, dtype: str, folder: Path, *options: str) -> dict[str, torch.Tensor]:
     file = folder / f"{engine}.safetensors"
-    Launched(engine, world, "jobs.engines", ["--write", str(file), "--dtype", dtype, *options], file).done()
+    Launched(
+        engine, world, "pipeline.benchmark.engines", ["--write", str(file), "--dtype", dtype, *options], file
+    ).done()
     return load_file(file)
 
 
@@ -210,8 +212,8 @@ def test_one_process_is_continued_sharded(root: Path, reference: Path, engine: s
 @pytest.mark.parametrize("train", ["full", "adapters"])
 def test_zero_gradients_in_float32(engine: str, train: str, truth: dict[str, torch.Tensor], tmp_path: Path) -> None:
     """DeepSpeed's master weights are float32: as near as DDP in float32, not nearer."""
-    own = truth if train == "full" else measured("ddp", 1, "float64", tmp_path, "--train", train)
-    difference = compare(own, measured(engine, 2, "float32", tmp_path, "--train", train))
+    own = truth if train == "full" else measured("ddp", 1, "float64", tmp_path, "--trainable", train)
+    difference = compare(own, measured(engine, 2, "float32", tmp_path, "--trainable", train))
     assert difference.gradient < 1e-4, difference.tensor
     assert difference.weight < 1e-5
 

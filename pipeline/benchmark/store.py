@@ -8,13 +8,19 @@ memory is that of its process; `baseline` is that of one that only loads what th
 from __future__ import annotations
 
 import dataclasses
+import os
+import re
+import shutil
+import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 
+from pipeline.benchmark.own_process import alone
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.describe.encode import BLOCK_BYTES
 from pipeline.evaluation.describe.store import DescriptorStore, StoreKey, StoreWriter
@@ -138,6 +144,73 @@ def recalls(output: Path, dims: int, k: int) -> tuple[float, list[float]]:
     start = time.perf_counter()
     results = evaluate_stores(output, [evaluated], config, (None, dims))
     return time.perf_counter() - start, [result.recalls[1] for result in results]
+
+
+def measure(
+    sizes: Sequence[tuple[int, int]], queries: int, stored: str, dims: int, recall: int, folder: str | None,
+    timeout: float,
+) -> Iterator[str]:  # fmt: skip
+    """Writes a store of each size and measures every step in a process of its own; a line a step.
+
+    Args:
+        sizes: (rows, dimensions) of the database.
+        queries: each another view of a known row.
+        stored: fp16 or fp32.
+        dims: dimensions that PCA keeps.
+        recall: neighbours searched.
+        folder: where stores are written and removed again; none: the temporary folder.
+        timeout: seconds after which a step is given up, and said so.
+
+    Raises:
+        UsageError: more queries than the rows allow; DataError: not enough room on the disk.
+    """
+    for rows, _ in sizes:
+        if (queries - 1) * APART >= rows:
+            raise UsageError(f"--queries {queries} needs more than {(queries - 1) * APART:,} rows")
+    base = alone(baseline, timeout).peak
+    threads = os.environ.get("OMP_NUM_THREADS", "all")
+    yield f"threads {threads}, {queries} queries, stored {stored}, PCA to {dims}; libraries alone {base / 1e6:,.0f} MB"
+    yield f"\n{'rows x dim':>18}  {'step':<14}{'peak MB':>9}{'above libraries':>17}{'seconds':>10}"
+    for rows, dim in sizes:
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            need = rows * (dim * (2 if stored == "fp16" else 4) + 200)
+            if shutil.disk_usage(scratch).free < 1.1 * need:
+                raise DataError(f"{scratch}: {rows} x {dim} need {need / 1e9:.1f} GB; give another --folder")
+            for name, work, arguments in steps(Path(scratch), rows, dim, queries, stored, dims, recall):
+                got = alone(work, timeout, *arguments)
+                seconds, note = (got.answer, "") if isinstance(got.answer, float) else (got.answer or (0.0, ""))
+                if note:
+                    note = "  R@1 " + " / ".join(f"{value:.1f}" for value in note)
+                if name == "write" and not got.problem:
+                    size = sum(f.stat().st_size for f in Path(scratch).rglob("*.parquet"))
+                    note = f"  {size / 1e6:,.0f} MB on disk"
+                figures = f"{got.peak / 1e6:9,.0f}{(got.peak - base) / 1e6:17,.0f}{seconds:10,.1f}{note}"
+                yield f"{f'{rows:,} x {dim:,}':>18}  {name:<14}{got.problem or figures}"
+                if got.problem and name == "write":
+                    break
+
+
+def steps(
+    folder: Path, rows: int, dim: int, queries: int, stored: str, dims: int, recall: int
+) -> list[tuple[str, Callable[..., Any], tuple[Any, ...]]]:
+    """(Name, work, its arguments) of every step."""
+    return [
+        ("write", write, (folder, rows, queries, dim, stored)),
+        ("read", read, (folder,)),
+        ("exact search", find, (folder, recall)),
+        ("PCA, sample", fit, (folder, dims, False)),
+        ("PCA, all rows", fit, (folder, dims, True)),
+        ("project", project, (folder, dims)),
+        ("recalls", recalls, (folder, dims, recall)),
+    ]
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """(rows, dimensions) of `100000x256`. Raises `UsageError`."""
+    found = re.fullmatch(r"(\d+)x(\d+)", text)
+    if found is None:
+        raise UsageError(f"--sizes {text}: give rows x dimensions, such as 100000x256")
+    return int(found[1]), int(found[2])
 
 
 def _store(output: Path, side: Side) -> DescriptorStore:

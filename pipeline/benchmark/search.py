@@ -1,11 +1,7 @@
 """What approximate search and PCA cost and keep: recall against exact, bytes, seconds; on made or stored descriptors.
 
-    python -m jobs.search_benchmark                                  100,000 x 256, made of clusters
-    python -m jobs.search_benchmark --store outputs/RUN/evaluation/descriptors/SET/single
-    python -m jobs.search_benchmark --pca 4096 --rows 16384 --dim 10752      PCA instead; --sklearn for its own beside
-
-Each measurement runs in a process of its own, so that its peak memory is its own. Seconds of CPU tell what a machine
-that others use as well would need alone.
+Invariant: each measurement runs in a process of its own, so that its peak memory is its own. Seconds of CPU tell what a
+machine that others use as well would need alone.
 """
 
 from __future__ import annotations
@@ -13,65 +9,46 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-from jobs.cli import parse, run_job
+import numpy as np
+
+from pipeline.benchmark.own_process import Measured, alone
 from pipeline.common.errors import DataError, UsageError
 
 BLOCK = 2_048  # rows made or read at a time
 
 
-@dataclass(frozen=True)
-class SearchBenchmarkJob:
-    """Measure search, or PCA where `pca` is given."""
+def searches(
+    store: str | None, rows: int, dim: int, queries: int, kinds: Sequence[str], recalls: Sequence[int],
+    timeout: float, seed: int,
+) -> Iterator[str]:  # fmt: skip
+    """A line for each kind of search.
 
-    rows: int = 100_000
-    """Database descriptors."""
-    dim: int = 256
-    """Numbers a descriptor."""
-    queries: int = 1_000
-    """Queries; of a store all of its own."""
-    recalls: tuple[int, ...] = (1, 10)
-    """Neighbours looked at: percent of the exact ones that were also found."""
-    kinds: tuple[str, ...] = ("exact", "hnsw", "ivfpq")
-    """What is measured."""
-    store: str | None = None
-    """A folder of stored descriptors (it holds database/ and queries/) instead of made ones."""
-    pca: int | None = None
-    """Measure PCA to so many dimensions instead of search."""
-    sklearn: bool = False
-    """Measure scikit-learn's PCA beside ours."""
-    timeout: float = 600.0
-    """Seconds after which one measurement is given up, and said so."""
-    seed: int = 0
-    """Of the made descriptors."""
-
-
-def main() -> None:
-    """Makes or opens the descriptors, measures, prints a table."""
-    job = parse(SearchBenchmarkJob, __doc__ or "")
-    from pipeline.benchmark.own_process import alone
-
-    threads = os.environ.get("OMP_NUM_THREADS", "all")
+    Args:
+        store: folder of stored descriptors (it holds database/ and queries/); none: made ones, [rows, dim].
+        rows, dim, queries: sizes of made descriptors.
+        kinds: `exact` and faiss's approximations.
+        recalls: the n of "percent of the n exact neighbours that were found".
+        timeout: seconds after which one measurement is given up, and said so.
+        seed: of made descriptors.
+    """
     with tempfile.TemporaryDirectory() as scratch:
-        if job.pca:
-            print(f"PCA of {job.rows:,} x {job.dim:,} to {job.pca:,}, threads: {threads}", flush=True)
-            file = Path(scratch) / "rows.bin"
-            make(file, job.rows, job.dim, job.seed, spectrum=True)
-            for kind in ("ours", "scikit-learn") if job.sklearn else ("ours",):
-                print(
-                    f"{kind:<14}{_line(alone(_pca, job.timeout, kind, str(file), job.rows, job.dim, job.pca))}",
-                    flush=True,
-                )
-            return
-        database, queries, n, asked, dim = descriptors(job, Path(scratch))
-        print(f"{asked:,} queries in {n:,} x {dim} descriptors, threads: {threads}", flush=True)
-        for kind in job.kinds:
-            print(
-                f"{kind:<8}{_line(alone(_search, job.timeout, kind, database, queries, dim, job.recalls))}", flush=True
-            )
+        database, asked, counts, dim = descriptors(store, rows, dim, queries, seed, Path(scratch))
+        yield f"{counts[1]:,} queries in {counts[0]:,} x {dim} descriptors, threads: {_threads()}"
+        for kind in kinds:
+            yield f"{kind:<8}{_line(alone(_search, timeout, kind, database, asked, dim, tuple(recalls)))}"
+
+
+def projections(rows: int, dim: int, dims: int, beside_sklearn: bool, timeout: float, seed: int) -> Iterator[str]:
+    """A line of our PCA of made descriptors [rows, dim] to `dims`, and one of scikit-learn's where asked."""
+    with tempfile.TemporaryDirectory() as scratch:
+        yield f"PCA of {rows:,} x {dim:,} to {dims:,}, threads: {_threads()}"
+        file = Path(scratch) / "rows.bin"
+        make(file, rows, dim, seed, spectrum=True)
+        for kind in ("ours", "scikit-learn") if beside_sklearn else ("ours",):
+            yield f"{kind:<14}{_line(alone(_pca, timeout, kind, str(file), rows, dim, dims))}"
 
 
 def make(file: Path, rows: int, dim: int, seed: int, spectrum: bool = False, centres: int = 5_000) -> None:
@@ -80,8 +57,6 @@ def make(file: Path, rows: int, dim: int, seed: int, spectrum: bool = False, cen
     Clusters (places seen several times) by default; with `spectrum` a variance that falls as 1/i along directions that
     two reflections mix, like that of descriptors.
     """
-    import numpy as np
-
     rng = np.random.Generator(np.random.PCG64(seed))
     fixed = np.random.Generator(np.random.PCG64(12_345))  # places and directions are the same for every seed
     middle = np.zeros((1, dim)) if spectrum else fixed.normal(size=(centres, dim)).astype(np.float32)
@@ -100,36 +75,38 @@ def make(file: Path, rows: int, dim: int, seed: int, spectrum: bool = False, cen
             out.write(part.astype(np.float32).tobytes())
 
 
-def descriptors(job: SearchBenchmarkJob, scratch: Path) -> tuple[str, str, int, int, int]:
+def descriptors(
+    folder: str | None, rows: int, dim: int, queries: int, seed: int, scratch: Path
+) -> tuple[str, str, tuple[int, int], int]:
     """(database, queries, their numbers, dimensions): raw float32 files, made or copied out of a store."""
     files = scratch / "database.bin", scratch / "queries.bin"
-    if job.store is None:
-        make(files[0], job.rows, job.dim, job.seed)
-        make(files[1], job.queries, job.dim, job.seed + 1)
-        return str(files[0]), str(files[1]), job.rows, job.queries, job.dim
-    import numpy as np
-
+    if folder is None:
+        make(files[0], rows, dim, seed)
+        make(files[1], queries, dim, seed + 1)
+        return str(files[0]), str(files[1]), (rows, queries), dim
     from pipeline.evaluation.describe.store import DescriptorStore
 
-    stores = [DescriptorStore(Path(job.store) / side) for side in ("database", "queries")]
+    stores = [DescriptorStore(Path(folder) / side) for side in ("database", "queries")]
     for store, file in zip(stores, files, strict=True):
         whole = np.memmap(file, np.float32, "w+", shape=(len(store), store.dim))
-        for rows, block in store.blocks():
-            whole[rows] = block
+        for numbers, block in store.blocks():
+            whole[numbers] = block
         whole.flush()
     if stores[0].dim != stores[1].dim:
-        raise DataError(f"{job.store}: database and queries have descriptors of different lengths; evaluate again")
-    return str(files[0]), str(files[1]), len(stores[0]), len(stores[1]), stores[0].dim
+        raise DataError(f"{folder}: database and queries have descriptors of different lengths; evaluate again")
+    return str(files[0]), str(files[1]), (len(stores[0]), len(stores[1])), stores[0].dim
 
 
-def _line(got: Any) -> str:
+def _threads() -> str:
+    return os.environ.get("OMP_NUM_THREADS", "all")
+
+
+def _line(got: Measured) -> str:
     """What `alone` measured."""
     return got.problem or f"{got.answer}  peak {got.peak / 1e9:.2f} GB"
 
 
 def _search(kind: str, database: str, queries: str, dim: int, ks: tuple[int, ...]) -> str:
-    import numpy as np
-
     from pipeline.evaluation.search.exact import agreement, build_index, index_bytes, search, search_index, slices
 
     rows = np.memmap(database, np.float32, "r").reshape(-1, dim)
@@ -148,9 +125,7 @@ def _search(kind: str, database: str, queries: str, dim: int, ks: tuple[int, ...
 
 
 def _pca(kind: str, file: str, rows: int, dim: int, dims: int) -> str:
-    import numpy as np
-
-    def blocks() -> Any:
+    def blocks() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         with Path(file).open("rb") as source:
             for first in range(0, rows, BLOCK):
                 block = np.fromfile(source, np.float32, min(BLOCK, rows - first) * dim).reshape(-1, dim)
@@ -171,7 +146,3 @@ def _pca(kind: str, file: str, rows: int, dim: int, dims: int) -> str:
         explained = float(PCA(dims).fit(np.concatenate([b for _, b in blocks()])).explained_variance_ratio_.sum())
     seconds = f"{time.perf_counter() - start:7.1f} s  {time.process_time() - busy:7.1f} s of CPU"
     return f"{seconds}  variance kept {explained:.5f}"
-
-
-if __name__ == "__main__":
-    run_job(main)

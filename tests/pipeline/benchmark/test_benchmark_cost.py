@@ -12,9 +12,9 @@ from processes import run_ranks
 from torch.nn.parallel import DistributedDataParallel
 
 from pipeline import distributed
+from pipeline.benchmark.cost import ROUNDS, StepSizes, collectives, engine_wire, forward_flops, step_sizes, table
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig
 from pipeline.model.vpr import build_model
-from pipeline.training.cost import ROUNDS, StepSizes, collectives, engine_wire, forward_flops, step_sizes, table
 from pipeline.training.loss import MultiSimilarityLoss
 
 SMALL = ModelConfig(
@@ -96,8 +96,9 @@ def test_table_and_engines() -> None:
     assert rows[0][:3] == ["1", "288", "0.0"]
     assert collectives(VIT_B, 1) == []
     once, twice = forward_flops(VIT_B, 2), forward_flops(replace(VIT_B, passes=2), 2)
-    assert twice["backbone"] == once["backbone"]  # joint training: one pass of the backbone, 1 % more in all
-    assert 1 < sum(twice.values()) / sum(once.values()) < 1.02
+    assert twice["backbone"] == once["backbone"]  # joint training: one pass of the backbone, under 1 % more in all
+    own = [sum(flops.values()) - flops["redundant"] for flops in (once, twice)]
+    assert 1 < own[1] / own[0] < 1.01
     half = replace(VIT_B, key_bytes=2)
     assert collectives(half, 2)[0].nbytes * 2 == collectives(VIT_B, 2)[0].nbytes
     # sharded parameters travel whole, frozen ones too: five times the bytes of DDP's gradients at ViT-B with adapters

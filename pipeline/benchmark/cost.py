@@ -10,13 +10,16 @@ Shapes: b images on a rank, B = b W in the global batch, R regions, D channels, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import torch
 
 from pipeline.common.errors import UsageError
 from pipeline.common.text import Table
+from pipeline.config import ModelConfig
 from pipeline.model.backbones.transformer import Backbone
 from pipeline.model.batch_norm import GlobalBatchNorm2d
-from pipeline.model.vpr import PlaceModel, parameter_counts
+from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
 
 ROUNDS = {"all_gather": 1, "reduce_scatter": 1, "all_reduce": 2}
 
@@ -167,3 +170,22 @@ def table(sizes: StepSizes, worlds: Sequence[int]) -> Table:
             + [f"{flops[part] / 1e9:,.0f}" for part in ("backbone", "own rows", "redundant")]
         )
     return Table(head, rows, left=())
+
+
+def tables(
+    config: ModelConfig,
+    image_size: int,
+    places_per_rank: int,
+    worlds: Sequence[int],
+    key_bytes: int = 4,
+    passes: int = 1,
+) -> tuple[Table, Table]:
+    """Of a model: the parts of a step; MB received for parameters and gradients under each engine, float32.
+
+    The model is built of shapes alone: no memory, and no weights file.
+    """
+    with torch.device("meta"):
+        model = build_model(replace(config, backbone=replace(config.backbone, weights=None)), image_size)
+    sizes = step_sizes(model, 4 * places_per_rank, key_bytes, passes)
+    rows = [[str(w), *(f"{engine_wire(e, sizes, w) / 1e6:,.0f}" for e in ("ddp", "fsdp2"))] for w in worlds]
+    return table(sizes, worlds), Table(["W", "ddp, zero1, zero2", "fsdp2, zero3"], rows, left=())

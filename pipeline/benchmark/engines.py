@@ -1,5 +1,8 @@
 """How far an engine is from one process: three steps on the same small global batches, whole tensors out.
 
+`differences` launches every engine in processes of its own; each of them is this file, run by a launcher:
+`accelerate launch --config_file FILE -m pipeline.benchmark.engines --write TENSORS`.
+
 Invariant: the batches, the weights they start from and the steps are functions of nothing but the code, dropout is 0,
 every rank has different images, and the optimiser is plain SGD, which does not hide a wrong scale as Adam does. So
 whatever the launch, the answers may differ by rounding alone.
@@ -7,16 +10,26 @@ whatever the launch, the answers may differ by rounding alone.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-from typing import Any, Literal
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import torch
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from pipeline.common.errors import UsageError
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, TrainConfig
 from pipeline.distributed import rank_slice
 from pipeline.model.vpr import build_model
 from pipeline.training.engines.build import build_engine
+from pipeline.training.launch import launched
 from pipeline.training.loss import MultiSimilarityLoss
 
 MODEL = ModelConfig(
@@ -26,6 +39,8 @@ MODEL = ModelConfig(
     trainable="full",
 )
 Trainable = Literal["adapters", "full", "frozen", "last"]
+# DeepSpeed keeps its master weights in float32, whatever it is given
+PRECISIONS = {"ddp": ("float64", "float32"), "fsdp2": ("float64", "float32")}
 PLACES, VIEWS, SIZE, STEPS, RATE = 8, 4, 56, 3, 0.1
 
 
@@ -133,3 +148,67 @@ def compare(truth: dict[str, Tensor], found: dict[str, Tensor]) -> Difference:
     moved = max((truth[f"weight/{n}"].double() - truth[f"start/{n}"].double()).abs().max().item() for n in floats)
     apart = max((truth[f"weight/{n}"].double() - found[f"weight/{n}"].double()).abs().max().item() for n in floats)
     return Difference(worst, where, apart / moved, len(gradients))
+
+
+def differences(
+    configs: Path, engines: Sequence[str], processes: int, trainable: Trainable, config: TrainConfig
+) -> Iterator[str]:
+    """Launches one process in float64, then every engine; a markdown table, line by line.
+
+    Args:
+        configs: folder of the launchers' configurations, `<engine>.yaml`.
+        engines: names of its files.
+        processes: ranks of each launch.
+        trainable: what of the backbone is trained.
+        config: `encode_chunk` and `passes` are used.
+
+    Raises:
+        UsageError: no such engine, or its launch failed.
+    """
+    for engine in engines:
+        if not (configs / f"{engine}.yaml").exists():
+            known = sorted(path.stem for path in configs.glob("*.yaml"))
+            raise UsageError(f"no engine '{engine}'; there are {', '.join(known)}")
+
+    def tensors(engine: str, world: int, dtype: str) -> dict[str, Tensor]:
+        file = Path(folder) / f"{engine}.{dtype}.safetensors"
+        options = ["--write", str(file), "--dtype", dtype, "--trainable", trainable]
+        options += ["--passes", config.passes]
+        options += [] if config.encode_chunk is None else ["--encode_chunk", str(config.encode_chunk)]
+        command = [sys.executable, "-m", "accelerate.commands.accelerate_cli", "launch", "--config_file"]
+        command += [str(configs / f"{engine}.yaml"), "--num_processes", str(world), "--mixed_precision", "no"]
+        command += ["-m", "pipeline.benchmark.engines", *options]
+        done = subprocess.run(command, capture_output=True, text=True, env={"OMP_NUM_THREADS": "1", **os.environ})
+        if done.returncode:
+            told = [line for line in done.stderr.splitlines() if line.startswith(UsageError.__module__)]
+            raise UsageError(f"engine {engine} failed: {told[0] if told else done.stderr[-2000:]}")
+        return load_file(file)
+
+    with tempfile.TemporaryDirectory() as folder:
+        truth = tensors("single", 1, "float64")
+        yield "| engine | numbers | gradients of the first step | weights after three steps | tensors |"
+        yield "|---|---|---|---|---|"
+        for engine in engines:
+            for dtype in PRECISIONS.get(engine, ("float32",)):
+                told = compare(truth, tensors(engine, processes, dtype))
+                yield f"| {engine} | {dtype} | {told.gradient:.1e} | {told.weight:.1e} | {told.tensors} |"
+
+
+def main() -> None:
+    """One measurement on this rank; rank 0 writes its tensors."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--write", required=True)
+    parser.add_argument("--dtype", choices=("float64", "float32"), default="float64")
+    parser.add_argument("--trainable", choices=get_args(Trainable), default="full")
+    parser.add_argument("--encode_chunk", type=int)
+    parser.add_argument("--passes", choices=("group", "joint"), default="group")
+    given = parser.parse_args()
+    with launched(timeout=300.0) as accelerator:
+        config = TrainConfig(encode_chunk=given.encode_chunk, passes=given.passes)
+        tensors = measure(accelerator, config, getattr(torch, given.dtype), given.trainable)
+        if tensors:
+            save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, given.write)
+
+
+if __name__ == "__main__":
+    main()
