@@ -22,7 +22,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from pipeline.common.errors import DataError
 from pipeline.common.files import sync_path, write_atomically
+from pipeline.common.pictures import read_file
 from shards import schema
 from shards.catalogue import Catalogue, LeftOut, runs
 from shards.images import ImageRule, Refused, admit
@@ -213,11 +215,13 @@ def _mean_position(photos: list[dict[str, Any]]) -> tuple[float | None, float | 
 
 def _read(path: Path, rule: ImageRule, facts: dict[str, Any]) -> bytes | Refused:
     try:
-        data = path.read_bytes()
+        data = read_file(path)
     except FileNotFoundError:
         return Refused("missing")
     except OSError as error:
         return Refused(f"cannot be read: {error.strerror}")
+    except DataError as error:
+        return Refused(f"cannot be read: {error}")
     stored = admit(data, rule)
     facts["made_again"] += not isinstance(stored, Refused) and stored is not data
     return stored

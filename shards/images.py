@@ -6,11 +6,14 @@ warning by the decoder that training uses; unless resizing or conversion was ask
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from typing import Literal
 
 import simplejpeg
+
+from pipeline.common import pictures
+from pipeline.common.errors import DataError
+from pipeline.common.text import shown
 
 Check = Literal["decode", "header", "none"]
 _KINDS = {
@@ -61,33 +64,37 @@ def check(data: bytes, how: Check = "decode") -> str | None:
         kind = next((kind for magic, kind in _KINDS.items() if data.startswith(magic)), "unknown data")
         return f"not a JPEG ({kind})"
     try:
+        height, width = simplejpeg.decode_jpeg_header(data)[:2]
+        pictures.check_size(width, height, data)
         if how == "header":
-            simplejpeg.decode_jpeg_header(data)
             return None if data.rstrip(b"\0").endswith(b"\xff\xd9") else "broken JPEG: no end marker"
         simplejpeg.decode_jpeg(data, "GRAY", min_height=1, min_width=1)
     except ValueError as error:
-        return f"broken JPEG: {error}"
+        return f"broken JPEG: {shown(error)}"
+    except DataError as error:
+        return str(error)
     return None
 
 
 def _again(data: bytes, resize: int) -> bytes | Refused:
     """Encodes a photo again: upright, RGB, its shorter side at most `resize` (0: any), quality 95."""
     import numpy as np
-    from PIL import Image, ImageOps
+    from PIL import Image
 
     try:
-        with Image.open(io.BytesIO(data)) as opened:
-            shorter = min(opened.size)
-            if resize and shorter <= resize and opened.format == "JPEG":
-                return data
-            factor = min(1.0, resize / shorter) if resize else 1.0
-            target = tuple(max(1, round(side * factor)) for side in opened.size)
-            if factor < 0.5:  # let the JPEG decoder halve first, never under twice the target
-                opened.draft("RGB", (2 * target[0], 2 * target[1]))
-            image = opened.convert("RGB")
-            if factor < 1:
-                image = image.resize((target[0], target[1]), Image.Resampling.BICUBIC)
-            upright = ImageOps.exif_transpose(image)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        return Refused(f"cannot be decoded: {error}")
+        opened = pictures.open_picture(data)
+        shorter = min(opened.size)
+        if resize and shorter <= resize and opened.format == "JPEG":
+            return data
+        factor = min(1.0, resize / shorter) if resize else 1.0
+        target = tuple(max(1, round(side * factor)) for side in opened.size)
+        if factor < 0.5:  # let the JPEG decoder halve first, never under twice the target
+            opened.draft("RGB", (2 * target[0], 2 * target[1]))
+        image = pictures.to_rgb(opened)
+        if factor < 1:
+            image = image.resize((target[0], target[1]), Image.Resampling.BICUBIC)
+        turn = pictures.turns(opened)
+    except DataError as error:
+        return Refused(str(error) if str(error).startswith("too large") else f"cannot be decoded: {error}")
+    upright = image if turn is None else image.transpose(turn)
     return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(upright), quality=QUALITY, colorsubsampling="420"))

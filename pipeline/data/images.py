@@ -6,24 +6,25 @@ completely raises `DataError`; nothing is ever replaced by a black image.
 The published training resizes with Pillow's bilinear filter, which antialiases. torch's antialiased bilinear resize of
 uint8 is the same filter in the same fixed-point arithmetic at a third of the time: over 150 photos at most 1 grey level
 apart, 0.00015 on average. Training and evaluation (`antialias`) both use it. JPEG decoding is simplejpeg where it is
-installed, and Pillow for everything else.
+installed, and Pillow (`pipeline.common.pictures`, which also bounds the size) for everything else.
 """
 
 from __future__ import annotations
 
-import io
-import warnings
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image
 from torch import Tensor
 from torch.nn import functional as F
 
+from pipeline.common import pictures
 from pipeline.common.errors import DataError
+from pipeline.common.pictures import check_size
+from pipeline.common.text import shown
 
 try:
     import simplejpeg
@@ -37,21 +38,19 @@ STD = (0.229, 0.224, 0.225)
 def decode(data: bytes) -> NDArray[np.uint8]:
     """An encoded image -> RGB, uint8 [H, W, 3]. Raises `DataError` with the reason (the caller names the file)."""
     pixels = _fast_jpeg(data)
-    return pixels if pixels is not None else np.asarray(_pillow(data))
+    return pixels if pixels is not None else np.asarray(pictures.decode(data))
 
 
 def load_image(source: Path | str | bytes) -> Image.Image:
     """A photo as an RGB Pillow image, upright by its EXIF orientation. Raises `DataError` naming the file."""
-    name = f"an image of {len(source)} bytes" if isinstance(source, bytes) else str(source)
+    name = f"an image of {len(source)} bytes" if isinstance(source, bytes) else shown(source)
     try:
-        data = source if isinstance(source, bytes) else Path(source).read_bytes()
-    except OSError as error:
-        raise DataError(
-            f"{name}: cannot be read ({error.strerror or error}); restore the file or leave it out"
-        ) from None
-    try:
+        data = source if isinstance(source, bytes) else pictures.read_file(Path(source))
         pixels = _fast_jpeg(data)
-        return Image.fromarray(pixels) if pixels is not None else _pillow(data)
+        return Image.fromarray(pixels) if pixels is not None else pictures.decode(data)
+    except (OSError, ValueError) as error:  # ValueError: a name with a NUL
+        told = error.strerror if isinstance(error, OSError) else error
+        raise DataError(f"{name}: cannot be read ({told or error}); restore the file or leave it out") from None
     except DataError as error:
         raise DataError(f"{name}: {error}; restore the file or leave it out") from None
 
@@ -97,22 +96,11 @@ def _fast_jpeg(data: bytes) -> NDArray[np.uint8] | None:
     if simplejpeg is None or not simplejpeg.is_jpeg(data) or data.find(b"Exif\0\0", 0, 65536) >= 0:
         return None
     try:
-        if simplejpeg.decode_jpeg_header(data)[2] not in ("YCbCr", "RGB", "Gray"):
+        height, width, colours, _ = simplejpeg.decode_jpeg_header(data)
+        if colours not in ("YCbCr", "RGB", "Gray"):
             return None
+        check_size(width, height, data)
         pixels: NDArray[np.uint8] = simplejpeg.decode_jpeg(data, colorspace="RGB")
         return pixels
     except ValueError as error:
-        raise DataError(f"does not decode as JPEG ({error})") from None
-
-
-def _pillow(data: bytes) -> Image.Image:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # damaged EXIF is no reason to speak: the pixels decide
-            image = Image.open(io.BytesIO(data))
-            image.load()
-            if image.mode in ("I", "I;16", "I;16B", "F"):
-                raise DataError(f"has {image.mode} pixels; convert it to 8 bits a channel")
-            return ImageOps.exif_transpose(image).convert("RGB")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise DataError(f"does not decode ({error})") from None
+        raise DataError(f"does not decode as JPEG ({shown(error)})") from None

@@ -107,3 +107,103 @@ def test_normalise_is_imagenets() -> None:
         found = normalise(levels, dtype)
         assert found.dtype == dtype and found.shape == levels.shape
         np.testing.assert_allclose(found[1].double().numpy(), expected, atol=tolerance)
+
+
+def header_bombs() -> dict[str, bytes]:
+    """Files of a few kB whose header promises gigabytes."""
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    small = Image.new("L", (64, 64), 128)
+    bombs = {}
+    for kind, progressive in (("plain", False), ("progressive", True)):
+        data = bytearray(encoded(small, "JPEG", progressive=progressive))
+        frame = data.index(b"\xff\xc2" if progressive else b"\xff\xc0")
+        data[frame + 5 : frame + 9] = struct.pack(">HH", 60_000, 60_000)
+        bombs[f"{kind}.jpg"] = bytes(data)
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0))
+    body = chunk(b"IDAT", zlib.compress(bytes(1 << 20))) + chunk(b"IEND", b"")
+    bombs["rows.png"] = b"\x89PNG\r\n\x1a\n" + header + body
+    scans = bytearray(encoded(small, "JPEG", progressive=True))
+    frame, scan = scans.index(b"\xff\xc2"), scans.rindex(b"\xff\xda")
+    scans[frame + 5 : frame + 9] = struct.pack(">HH", 10_000, 10_000)
+    bombs["scans.jpg"] = bytes(scans[:scan] + scans[scan:-2] * 300 + scans[-2:])
+    return bombs
+
+
+@pytest.mark.parametrize("name", ["plain.jpg", "progressive.jpg", "rows.png", "scans.jpg"])
+def test_what_would_decode_to_gigabytes_is_refused_by_its_header(name: str, tmp_path: Path) -> None:
+    """In preparing, training, evaluation; within the memory that the process has already."""
+    import resource
+
+    from shards.images import ImageRule, Refused, admit
+
+    data = header_bombs()[name]
+    assert len(data) < 40_000
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(DataError, match=rf"{name}: too large: [0-9,x ]+ pixels"):
+        load_image(tmp_path / name)
+    with pytest.raises(DataError, match="too large"):
+        decode(data)
+    for rule in (ImageRule(convert=True), ImageRule(check="header", convert=True), ImageRule("none", 300, True)):
+        refused = admit(data, rule)
+        assert isinstance(refused, Refused) and "too large" in refused.reason
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+def ramp(kind: str) -> tuple[Image.Image, np.ndarray]:
+    """A picture of a mode Pillow knows, 64 x 16, its values over the whole range; and what it shows, uint8 grey."""
+    shown = np.tile(np.arange(0, 256, 4, dtype=np.uint8), (16, 1))
+    grey = Image.fromarray(shown)
+    if kind == "I;16":
+        return Image.fromarray(shown.astype(np.uint16) * 257), shown
+    if kind == "1":
+        return grey.convert("1", dither=Image.Dither.NONE), np.where(shown > 127, 255, 0)
+    if kind in ("LA", "RGBA"):
+        image = grey.convert(kind)
+        image.putalpha(Image.new("L", image.size, 90))
+        return image, shown
+    return grey.convert(kind), shown
+
+
+@pytest.mark.parametrize(
+    ("mode", "kind"),
+    [("I;16", "PNG"), ("I;16", "TIFF"), ("1", "PNG"), ("1", "TIFF"), ("LA", "PNG"), ("RGBA", "PNG"), ("P", "PNG"),
+     ("CMYK", "TIFF"), ("YCbCr", "TIFF"), ("P", "GIF"), ("RGBA", "WEBP")],
+)  # fmt: skip
+def test_no_kind_of_pixels_is_clipped(mode: str, kind: str, tmp_path: Path) -> None:
+    """A 16-bit grey PNG read with Pillow's own convert("RGB") comes out white."""
+    from shards.images import ImageRule, admit
+
+    image, expected = ramp(mode)
+    options = {"WEBP": {"lossless": True}, "PNG": {"transparency": 3} if mode == "P" else {}}
+    path = tmp_path / "photo.png"
+    image.save(path, kind, **options.get(kind, {}))
+    found = np.asarray(load_image(path)).astype(int)
+    assert np.abs(found - expected[..., None]).max() <= 2
+    if kind == "PNG":
+        stored = admit(path.read_bytes(), ImageRule(convert=True))
+        assert isinstance(stored, bytes)
+        assert np.abs(decode(stored).astype(int) - expected[..., None]).mean() < 3
+
+
+@pytest.mark.parametrize("mode", ["F", "I"])
+def test_pixels_of_no_known_range_are_refused(mode: str, tmp_path: Path) -> None:
+    Image.fromarray(np.full((8, 8), 70_000, np.float32 if mode == "F" else np.int32)).save(tmp_path / "x.tif")
+    with pytest.raises(DataError, match=rf"x\.tif: has {mode} pixels .* convert it to 8 bits"):
+        load_image(tmp_path / "x.tif")
+
+
+def test_a_pipe_and_a_program_under_a_photos_name_are_refused(tmp_path: Path) -> None:
+    import os
+
+    os.mkfifo(tmp_path / "pipe.jpg")
+    with pytest.raises(DataError, match="is not an ordinary file"):
+        load_image(tmp_path / "pipe.jpg")
+    (tmp_path / "page.jpg").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n")
+    with pytest.raises(DataError, match="does not decode"):  # Pillow would start Ghostscript
+        load_image(tmp_path / "page.jpg")
