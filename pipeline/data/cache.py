@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.common.errors import DataError, UsageError
+from pipeline.common.text import shown
+from shards.schema import is_shard_name
 
 if TYPE_CHECKING:
     from shards.index import ShardIndex
@@ -47,6 +49,8 @@ class ShardCache:
         self.local = local_folder(index.root)
         self.base, self.limit = folder, limit
         self.folder = folder / index.digest[:16]  # sets never mix, also under equal shard names
+        if wrong := [name for name in self.shards if not is_shard_name(name)]:  # it becomes a path in the cache
+            raise DataError(f"{self.root}: the manifest names a shard '{shown(wrong[0])}', not a plain file name")
         self.attempts = 3  # to fetch a shard
         self.wanted: frozenset[str] = frozenset()  # evicted only when nothing else is left
 
@@ -71,7 +75,7 @@ class ShardCache:
         while True:
             path = self.local / name if self.local is not None else self.fetch(name)
             try:
-                descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+                descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe would be waited for
             except FileNotFoundError:
                 if self.remote:  # evicted between the two lines above
                     continue

@@ -27,7 +27,8 @@ from pipeline.config import DataConfig
 from pipeline.data.cache import ShardCache
 from pipeline.data.places import build_loader
 from pipeline.data.prefetch import FetchAhead
-from shards.index import ShardIndex
+from shards.index import ShardIndex, read_index
+from shards.schema import sealed_manifest
 
 Make = Callable[..., ShardIndex]
 SIZE = 100_000
@@ -46,6 +47,30 @@ def remote(make_table: Make, request: pytest.FixtureRequest) -> ShardIndex:
         shards.append({"name": name, "bytes": SIZE, "sha256": hashlib.sha256(raw).hexdigest(), "samples": 1})
     index = make_table([4])
     return dataclasses.replace(index, root=root, manifest={**index.manifest, "shards": shards})
+
+
+@pytest.mark.parametrize("name", ["../../x.pth", "../x.tar", "/tmp/x.tar", "a/b.tar", "x\0.tar", "x.tar.lock", ".tar"])
+def test_a_shard_name_that_leads_elsewhere_is_refused_before_anything_is_made(
+    name: str, remote: ShardIndex, tmp_path: Path
+) -> None:
+    """In a manifest sealed with good hashes: when the set is opened, and where a cache is made of it otherwise."""
+    shard = {**remote.manifest["shards"][0], "name": name, "bytes": 10_240}
+    ones = ("places", "places_named", "rounds", "samples", "shards")
+    others = "places_under_four places_fallen images_named images_used images_bad images_unused duplicates unlisted"
+    counts = {**dict.fromkeys(ones, 1), **dict.fromkeys([*others.split(), "made_again"], 0), "bytes": 10_240}
+    digests = dict.fromkeys(("index_sha256", "report_sha256"), "0" * 64)
+    told = {"format_version": 2, "settings": {"rounds": 1}, "counts": counts, "left_out": {}, "shards": [shard]}
+    sealed = sealed_manifest({**told, **digests})
+    for file, raw in (("manifest.json", sealed), ("index.parquet", b"")):
+        with fsspec.open(f"{remote.root}/{file}", "wb") as target:
+            target.write(raw)
+    with pytest.raises(DataError, match=r"manifest\.json shards\[0\]\.name is .*, not the plain") as caught:
+        read_index(remote.root)
+    assert str(caught.value).isprintable()
+    cache = tmp_path / "deep" / "cache"
+    with pytest.raises(DataError, match="not a plain file name"):
+        ShardCache(dataclasses.replace(remote, manifest={**remote.manifest, "shards": [shard]}), cache, 9 * SIZE)
+    assert not list(tmp_path.iterdir())
 
 
 def content(index: ShardIndex, name: str) -> bytes:
