@@ -120,7 +120,7 @@ def _point(positions: np.ndarray | None, row: int) -> tuple[float, float] | None
 
 
 def _metres(index: PhotoIndex, row: int, own: tuple[float, float] | None) -> float | None:
-    """Distance of a photo's own GPS to a place: in the index's UTM zone, or along the great circle."""
+    """Distance of a photo's own GPS to a place: in the index's UTM zone, or along the ellipsoid."""
     position = _point(index.positions, row)
     if own is None or position is None:
         return None

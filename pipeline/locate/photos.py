@@ -18,7 +18,15 @@ import numpy as np
 from pipeline.common.errors import DataError, UsageError
 from pipeline.evaluation.sets.evaluation_set import list_images
 from pipeline.evaluation.sets.manifest import SUFFIXES, read_photos
-from pipeline.evaluation.sets.utm import WIDEST, file_positions, file_zone, meridian_offset, to_utm, utm_zone
+from pipeline.evaluation.sets.utm import (
+    WIDEST,
+    file_positions,
+    file_zone,
+    meridian_offset,
+    position_remarks,
+    to_utm,
+    utm_zone,
+)  # fmt: skip
 from pipeline.locate.gps import gps_positions
 
 
@@ -117,7 +125,7 @@ def _of_source(source: Path, progress: bool) -> tuple[list[Path], np.ndarray | N
     photos = list_images(source)
     positions = file_positions(photos)
     if positions is not None:
-        return photos, positions, "utm", ""
+        return photos, positions, "utm", "; ".join(position_remarks(photos, positions))
     positions, remark = gps_positions(photos, progress)
     return photos, positions, "none" if positions is None else "gps", remark
 

@@ -10,10 +10,12 @@ import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
 from pipeline.common.errors import DataError
+from pipeline.common.text import shown
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})
 
@@ -68,17 +70,29 @@ def list_images(folder: Path, natural: bool = False) -> list[Path]:
     """All images below `folder` (jpg, jpeg, png in any case), sorted by path as the field does.
 
     `natural` sorts runs of digits by value, for sequences whose numbers are not zero-padded. Hidden files are
-    skipped, linked folders followed. Raises `DataError` when there are none.
+    skipped, linked folders followed, each once. Raises `DataError` when there are none, or a folder cannot be read.
     """
-    found = [
-        Path(parent, name)
-        for parent, folders, names in os.walk(folder, followlinks=True)
-        for name in names
-        if Path(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith(".")
-    ]
+    found: list[Path] = []
+    entered: set[tuple[int, int]] = set()
+    for parent, below, names in os.walk(folder, followlinks=True, onerror=_unreadable):
+        state = os.stat(parent)  # noqa: PTH116
+        if (state.st_dev, state.st_ino) in entered:  # a link back up, or a second way to the same photos
+            below.clear()
+            continue
+        entered.add((state.st_dev, state.st_ino))
+        below[:] = sorted(name for name in below if not name.startswith((".", "__MACOSX")))
+        found += [
+            Path(parent, name)
+            for name in names
+            if Path(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith(".")
+        ]
     if not found:
         raise DataError(f"{folder}: no jpg, jpeg or png image in this folder or below it")
     return sorted(found, key=_natural if natural else str)
+
+
+def _unreadable(error: OSError) -> NoReturn:
+    raise DataError(f"{shown(error.filename)}: cannot be read ({error.strerror}); give yourself permission to read it")
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -1,7 +1,7 @@
 """Which database images are correct for a query: within a radius in metres, within some frames, or named pairs.
 
 Invariant: every rule returns Q sorted int64 arrays of database rows; distances are taken in float64 and the bound
-is inclusive, so published counts come out exactly; memory is bounded by the pairs examined at a time.
+is inclusive, so published counts come out exactly.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.common.errors import DataError
 
-PAIRS_AT_A_TIME = 2_000_000
+QUERIES_AT_A_TIME = 4_096
 
 
 def within_radius(
@@ -21,63 +21,26 @@ def within_radius(
     """Database rows at most `radius` metres from each query.
 
     `database` [N, 2] and `queries` [Q, 2] are positions in metres, float64; `parts`, where given, are two integer
-    arrays [N] and [Q] (a city, say), and only rows of the query's own part count. Exact: a grid with cells just
-    wider than the radius picks candidates from 3 x 3 cells and every candidate's distance is computed.
+    arrays [N] and [Q] (a city, say), and only rows of the query's own part count. Exact: scipy's k-d tree finds
+    candidates within a slightly larger radius, and every candidate's distance is computed and compared here, so that
+    the tree's own rounding decides nothing.
     """
     if parts is not None:
         return _by_part(database, queries, radius, *parts)
+    from scipy.spatial import cKDTree
+
     database = np.asarray(database, np.float64).reshape(-1, 2)
     queries = np.asarray(queries, np.float64).reshape(-1, 2)
     if len(database) == 0 or len(queries) == 0:
         return [np.zeros(0, np.int64) for _ in queries]
-    origin = database.min(axis=0)
-    extent = float((database.max(axis=0) - origin).max())
-    # wider than the radius, lest rounding in the division puts two points at exactly that distance two cells apart;
-    # and not so fine that the cell number overflows
-    cell = max(radius * (1 + 1e-6), extent / 1e6, 1e-6)
-    column, row = np.floor((database - origin) / cell).astype(np.int64).T
-    span = int(row.max()) + 3  # an empty row on both sides keeps neighbours of different columns apart
-    number = column * span + row + 1
-    order = np.argsort(number, kind="stable")
-    number = number[order]
-    # queries far outside fall into the empty rim, where there is nothing to find
-    spot = np.clip(np.floor((queries - origin) / cell), -2, [column.max() + 2, row.max() + 2]).astype(np.int64)
-    # three cells of a column are neighbours in the sorted order, so a query has three ranges of candidates
-    lowest = np.clip(spot[:, 1], 0, span - 1)
-    highest = np.clip(spot[:, 1] + 2, 0, span - 1)
-    columns = spot[:, :1] + np.arange(-1, 2)
-    starts = np.searchsorted(number, columns * span + lowest[:, None], side="left")
-    ends = np.searchsorted(number, columns * span + highest[:, None], side="right")
-    counts = np.maximum(ends - starts, 0)
-    edges = np.concatenate([[0], np.cumsum(counts.sum(axis=1))])
+    tree = cKDTree(database)
     found: list[np.ndarray] = []
-    first = 0
-    while first < len(queries):
-        last = max(first + 1, int(np.searchsorted(edges, edges[first] + PAIRS_AT_A_TIME, side="right")) - 1)
-        found += _near(database, queries[first:last], radius, order, starts[first:last], counts[first:last])
-        first = last
+    for first in range(0, len(queries), QUERIES_AT_A_TIME):
+        block = queries[first : first + QUERIES_AT_A_TIME]
+        for query, near in zip(block, tree.query_ball_point(block, radius * (1 + 1e-6) + 1e-6), strict=True):
+            rows = np.sort(np.array(near, np.int64))
+            found.append(rows[((database[rows] - query) ** 2).sum(axis=1) <= radius**2])
     return found
-
-
-def _near(
-    database: np.ndarray,
-    queries: np.ndarray,
-    radius: float,
-    order: np.ndarray,
-    starts: np.ndarray,
-    counts: np.ndarray,
-) -> list[np.ndarray]:
-    """Candidates [q, 3 ranges] of a block of queries, each distance computed and compared."""
-    flat = counts.ravel()
-    within = np.arange(flat.sum()) - np.repeat(np.cumsum(flat) - flat, flat)
-    rows = order[np.repeat(starts.ravel(), flat) + within]
-    query = np.repeat(np.repeat(np.arange(len(queries)), counts.shape[1]), flat)
-    offset = database[rows] - queries[query]
-    near = (offset**2).sum(axis=1) <= radius**2
-    rows, query = rows[near], query[near]
-    arranged = np.lexsort((rows, query))
-    edges = np.cumsum(np.bincount(query, minlength=len(queries)))[:-1]
-    return np.split(rows[arranged].astype(np.int64), edges)
 
 
 def _by_part(

@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.common.errors import DataError
+from pipeline.common.text import shown
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet, list_images
 from pipeline.evaluation.sets.ground_truth import paired, within_frames, within_radius
-from pipeline.evaluation.sets.utm import file_position, file_positions
+from pipeline.evaluation.sets.utm import file_position, file_positions, position_remarks
 
 NAMED = "name images @UTM_east@UTM_north@...@.jpg, set frames for sequences without positions, or write a manifest"
 
@@ -35,18 +36,27 @@ def database_folder(base: Path) -> Path | None:
 
 
 def from_folders(
-    name: str, base: Path, config: EvaluationConfig, queries: Sequence[str] = ("queries",)
+    name: str,
+    base: Path,
+    config: EvaluationConfig,
+    queries: Sequence[str] = ("queries",),
+    unlabelled: bool = False,
 ) -> EvaluationSet:
-    """A set from `base`/{database,<queries>}: metres where names carry positions, else +- `config.frames`."""
+    """A set from `base`/{database,<queries>}: metres where names carry positions, else +- `config.frames`.
+
+    With neither it is refused, or, where `unlabelled`, a set without ground truth: answers are shown, not scored.
+    """
     folder = database_folder(base)
     if folder is None:
         raise DataError(f"{base}: expected the folders database (or gallery) and {' and '.join(queries)} here")
     in_database = list_images(folder)
     in_queries = [path for part in queries for path in list_images(base / part)]
-    return by_position(name, in_database, in_queries, config)
+    return by_position(name, in_database, in_queries, config, unlabelled)
 
 
-def by_position(name: str, database: list[Path], queries: list[Path], config: EvaluationConfig) -> EvaluationSet:
+def by_position(
+    name: str, database: list[Path], queries: list[Path], config: EvaluationConfig, unlabelled: bool = False
+) -> EvaluationSet:
     """Positives by the positions in file names within `config.radius`; without positions, by `config.frames`."""
     of_database, of_queries = file_positions(database), file_positions(queries)
     if of_database is not None and of_queries is not None:
@@ -59,11 +69,15 @@ def by_position(name: str, database: list[Path], queries: list[Path], config: Ev
             f"{config.radius:g} m",
             of_database,
             of_queries,
-            remarks=ignored,
+            remarks=ignored + position_remarks([*database, *queries], np.concatenate([of_database, of_queries])),
         )
+    if unlabelled and of_database is None and of_queries is None and config.frames is None:
+        empty = [np.zeros(0, np.int64) for _ in queries]
+        told = f"no position in the names: answers are shown, not scored; to score them, {NAMED}"
+        return EvaluationSet(name, database, queries, empty, "no ground truth", has_ground_truth=False, remarks=(told,))
     if of_database is not None or of_queries is not None or config.frames is None:
         bare = database[0] if of_database is None else queries[0]
-        raise DataError(f"{bare}: no position in this name; {NAMED}")
+        raise DataError(f"{shown(bare)}: no position in this name; {NAMED}")
     return by_frame(name, database, queries, config.frames)
 
 

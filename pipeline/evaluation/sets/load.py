@@ -12,17 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.common.errors import DataError, UsageError
+from pipeline.common.text import shown
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.sets import layouts, msls
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet, clean_name, list_images
-from pipeline.evaluation.sets.fixed_lists import from_lists, list_prefix
-from pipeline.evaluation.sets.manifest import SUFFIXES, from_manifest
-from pipeline.evaluation.sets.registry import SETS, count_remark, published_name
+from pipeline.evaluation.sets.fixed_lists import SPLITS, Lists, find_lists, from_lists, photos_there
+from pipeline.evaluation.sets.manifest import SUFFIXES, from_manifest, manifest_in
+from pipeline.evaluation.sets.registry import SETS, count_remark, key, published_name
 
 __all__ = ["Availability", "EvaluationSet", "available", "list_images", "load_set", "load_sets"]
 
 DEFAULT_ROUTE = "night_right->day_right"
-SPLITS = ("train", "val", "test")
+TABLES = (".npy", ".npz", ".mat", ".csv", ".parquet")  # files that may say what is correct
 
 
 def load_set(name_or_path: str, config: EvaluationConfig) -> EvaluationSet:
@@ -52,7 +53,7 @@ def load_set(name_or_path: str, config: EvaluationConfig) -> EvaluationSet:
         )
     if not path.exists():
         raise DataError(
-            f"{text}: neither a path, nor a folder below root '{config.root}', nor one of the sets "
+            f"{shown(text)}: neither a path, nor a folder below root '{config.root}', nor one of the sets "
             f"{', '.join(sorted(SETS))}"
         )
     loaded = _load_path(path, config, route)
@@ -76,15 +77,19 @@ def load_sets(names: Sequence[str], config: EvaluationConfig) -> tuple[list[Eval
 def _load_published(name: str, folder: Path, config: EvaluationConfig, route: str) -> EvaluationSet:
     entry = SETS[name]
     loaded: EvaluationSet
-    if entry.layout in ("utm", "svox"):
+    lists = _published_lists(name, folder, config.split)
+    if lists is not None and (entry.layout != "msls_val" or photos_there(lists, config.root)):
+        loaded = dataclasses.replace(from_lists(lists, config), name=name)
+    elif entry.layout in ("utm", "svox"):
         base = layouts.split_folder(folder, config.split, entry.queries)
         if base is None:
             raise DataError(_missing(name, config.root, folder))
-        loaded = layouts.from_folders(name, base, config, entry.queries)
+        loaded = _unread(layouts.from_folders(name, base, config, entry.queries), folder, base)
     elif entry.layout == "pairs":
-        loaded = layouts.pairs(name, folder, config)
+        loaded = _unread(layouts.pairs(name, folder, config), folder)
     elif entry.layout == "nordland":
         loaded = layouts.nordland(name, folder, config, entry.frames, sparse=name == "nordland_star")
+        loaded = _unread(loaded, folder)
     elif entry.layout == "gardens_point":
         title = clean_name(f"{name}_{route}".replace("->", "_in_")) if route else name
         loaded = layouts.traverses(title, folder, config, route or DEFAULT_ROUTE, entry.frames)
@@ -95,6 +100,40 @@ def _load_published(name: str, folder: Path, config: EvaluationConfig, route: st
     return _remarked(loaded, name, config.split)
 
 
+def _published_lists(name: str, folder: Path, split: str) -> Lists | None:
+    """The fixed lists of a published set in its folder, where one list can stand for the set; None where none lie."""
+    entry = SETS[name]
+    if entry.layout not in ("utm", "pairs", "msls_val") or entry.queries != ("queries",):
+        return None  # lists of Nordland are one of its two protocols, those of SVOX one of its conditions
+    try:
+        lists = find_lists(folder, split)
+    except UsageError:
+        return None
+    if lists is None:
+        return None
+    named = {published_name(lists.prefix), published_name(lists.prefix.removesuffix(f"_{split}"))}
+    return lists if name in named else None
+
+
+def _lists_that_decide(folder: Path, config: EvaluationConfig) -> Lists | None:
+    """The fixed lists in a folder that say what its set is, also where it holds database/ and queries/ as well.
+
+    Lists of another split than the one whose folders are there do not, nor, beside Mapillary's own tables, do lists
+    whose photos are not on disk.
+    """
+    base = layouts.split_folder(folder, config.split)
+    of_split = base is not None and base != folder
+    try:
+        lists = find_lists(folder, config.split)
+    except UsageError:
+        if of_split:
+            return None
+        raise
+    if lists is None or (of_split and lists.split not in ("", config.split)):
+        return None
+    return None if msls.original_cities(folder) and not photos_there(lists, config.root) else lists
+
+
 def _remarked(loaded: EvaluationSet, name: str | None, split: str) -> EvaluationSet:
     """With a remark where its counts are not the published ones."""
     remark = count_remark(name, split, len(loaded.database), len(loaded.queries)) if name else None
@@ -102,30 +141,57 @@ def _remarked(loaded: EvaluationSet, name: str | None, split: str) -> Evaluation
 
 
 def _load_path(path: Path, config: EvaluationConfig, route: str) -> EvaluationSet:
-    """A set by what lies at `path`."""
+    """A set by what lies at `path`. In a folder, fixed lists decide, then a manifest, then the layout."""
     name = _path_name(path)
-    if path.is_dir():
+    if path.is_file():
+        if path.suffix.lower() in SUFFIXES:
+            return from_manifest(path, config)
+        lists = find_lists(path, config.split)
+    else:
         if route or (path / "day_left").is_dir():
             title = clean_name(f"{name}_{route}".replace("->", "_in_")) if route else name
             return layouts.traverses(title, path, config, route or DEFAULT_ROUTE, SETS["gardens_point"].frames)
+        lists = _lists_that_decide(path, config)
+    if lists is not None:
+        return from_lists(lists, config)
+    if path.is_dir():
+        manifest = manifest_in(path)
+        if manifest is not None:
+            return dataclasses.replace(from_manifest(manifest, config), name=name)
         base = layouts.split_folder(path, config.split)
         if base is not None:
-            return layouts.from_folders(name, base, config)
+            return _unread(layouts.from_folders(name, base, config, unlabelled=True), path, base)
         if msls.original_cities(path):
             return msls.val("msls_val", path, config)
         if msls.challenge_cities(path):
             return msls.challenge("msls_challenge", path, config)
         if layouts.pair_folders(path, config.split) is not None:
-            return layouts.pairs(name, path, config)
-    elif path.suffix.lower() in SUFFIXES:
-        return from_manifest(path, config)
-    prefix = list_prefix(path, config.split)
-    if prefix is not None:
-        return from_lists(prefix, config)
+            return _unread(layouts.pairs(name, path, config), path)
     raise DataError(
-        f"{path}: no evaluation set here; expected images/{config.split}/{{database,queries}}, database/ and queries/, "
-        "a .csv or .parquet manifest, or *_dbImages.npy with *_qImages.npy"
+        f"{shown(path)}: no evaluation set here; expected images/{config.split}/{{database,queries}}, database/ and "
+        f"queries/, a .csv or .parquet manifest, or *_dbImages.npy with *_qImages.npy; {_contents(path)}"
     )
+
+
+def _unread(loaded: EvaluationSet, *folders: Path) -> EvaluationSet:
+    """With a remark that names tables and lists beside the photos that were not read."""
+    left = [file.name for folder in dict.fromkeys(folders) for file in sorted(folder.iterdir())
+            if file.suffix.lower() in TABLES and not file.name.startswith(".")]  # fmt: skip
+    if not left:
+        return loaded
+    more = f" and {len(left) - 5} more" if len(left) > 5 else ""
+    return dataclasses.replace(
+        loaded, remarks=(*loaded.remarks, f"not read: {', '.join(map(shown, left[:5]))}{more}; the folders decide")
+    )
+
+
+def _contents(path: Path) -> str:
+    """What lies at a path, in a few words."""
+    if not path.is_dir():
+        return "this is a file"
+    names = sorted(entry.name + ("/" if entry.is_dir() else "") for entry in path.iterdir())
+    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+    return f"it holds {', '.join(map(shown, names[:6]))}{more}" if names else "it is empty"
 
 
 def _path_name(path: Path) -> str:
@@ -137,10 +203,17 @@ def _path_name(path: Path) -> str:
 
 
 def _find(root: str, name: str, split: str) -> Path | None:
-    """The folder below `root`, in any case, where the set lies; else the first that has one of its names."""
+    """The folder below `root` where the set lies, in any case and however joined (`msls-val`, `pitts30k-val`).
+
+    Of several the first that holds the set; else the first that has one of its names.
+    """
     below = Path(root).expanduser()
-    present = {p.name.lower(): p for p in sorted(below.iterdir()) if p.is_dir()} if below.is_dir() else {}
-    named = [present[alias.lower()] for alias in SETS[name].folders if alias.lower() in present]
+    present: dict[str, Path] = {}
+    for folder in sorted(below.iterdir()) if below.is_dir() else ():
+        if folder.is_dir():
+            present.setdefault(key(folder.name), folder)
+    names = [alias + end for end in ("", split) for alias in map(key, SETS[name].folders)]
+    named = [present[alias] for alias in names if alias in present]
     return next((folder for folder in named if _is_there(name, folder, split)), named[0] if named else None)
 
 
@@ -156,12 +229,14 @@ def _is_there(name: str, folder: Path, split: str) -> bool:
         "msls_val": lambda: msls.original_cities(folder) or msls.utm_base(folder),
         "msls_challenge": lambda: msls.challenge_cities(folder) or None,
     }
-    return looks[entry.layout]() is not None
+    return looks[entry.layout]() is not None or _published_lists(name, folder, split) is not None
 
 
 def _missing(name: str, root: str, folder: Path | None = None) -> str:
     expected = folder or Path(root) / SETS[name].folders[0]
-    return f"{name} is not there: expected {expected}/ with {SETS[name].looks}"
+    return f"{name} is not there: expected {expected}/ with {SETS[name].looks}" + (
+        f"; {_contents(folder)}" if folder else ""
+    )
 
 
 @dataclass(frozen=True)
@@ -180,14 +255,14 @@ def available(root: str, split: str = "test") -> list[Availability]:
     """All published sets and every other folder with database and queries below `root`, present or missing."""
     below = Path(root).expanduser()
     found = []
-    known: set[str] = set()
-    for name, entry in SETS.items():
+    known: set[Path | None] = set()
+    for name in SETS:
         folder = _find(root, name, split)
         if folder is not None and not _is_there(name, folder, split):
             folder = None
-        known |= {alias.lower() for alias in entry.folders}
+        known |= {folder, _find(root, name, split)}
         found.append(Availability(name, folder, _missing(name, root).partition("expected ")[2]))
     for folder in sorted(below.iterdir()) if below.is_dir() else []:
-        if folder.is_dir() and folder.name.lower() not in known and layouts.split_folder(folder, split) is not None:
+        if folder.is_dir() and folder not in known and layouts.split_folder(folder, split) is not None:
             found.append(Availability(folder.name, folder, str(folder)))
     return found

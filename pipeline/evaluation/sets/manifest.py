@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.common.errors import DataError
+from pipeline.common.errors import DataError, UsageError
+from pipeline.common.text import shown
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet, clean_name
 from pipeline.evaluation.sets.fixed_lists import existing
 from pipeline.evaluation.sets.ground_truth import within_frames, within_radius
-from pipeline.evaluation.sets.utm import to_utm
+from pipeline.evaluation.sets.utm import degrees_for_metres, to_utm
 
 SUFFIXES = (".csv", ".parquet")
 
@@ -40,7 +41,7 @@ def from_manifest(path: Path, config: EvaluationConfig) -> EvaluationSet:
         split[row["role"]].append(at)
     database, queries = ([rows[at] for at in split[role]] for role in ("database", "query"))
     photos = [existing([path.parent / str(row["image"]) for row in side], str(path)) for side in (database, queries)]
-    places = _positions(path, rows)
+    places, remarks = _positions(path, rows)
     of_database = None if places is None else places[split["database"]]
     of_queries = None if places is None else places[split["query"]]
     if "positives" in columns:
@@ -60,7 +61,37 @@ def from_manifest(path: Path, config: EvaluationConfig) -> EvaluationSet:
         raise DataError(
             f"{path}: needs positives, frame, utm_east and utm_north, or lat and lon; it has {', '.join(columns)}"
         )
-    return EvaluationSet(clean_name(path.stem), photos[0], photos[1], positives, rule, of_database, of_queries)
+    return EvaluationSet(
+        clean_name(path.stem), photos[0], photos[1], positives, rule, of_database, of_queries, remarks=remarks
+    )
+
+
+def manifest_in(folder: Path) -> Path | None:
+    """The table in a folder that has the columns of a manifest; None where there is none.
+
+    Raises `UsageError` where several have them.
+    """
+    found = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES and _has_columns(file)]
+    if len(found) > 1:
+        names = ", ".join(shown(file.name) for file in found)
+        raise UsageError(f"{folder}: {names} are all manifests; give one of the files instead of the folder")
+    return found[0] if found else None
+
+
+def _has_columns(file: Path) -> bool:
+    if file.name.startswith("."):
+        return False
+    try:
+        if file.suffix.lower() == ".parquet":
+            from pyarrow import parquet
+
+            columns = set(parquet.read_schema(file).names)
+        else:
+            with file.open(newline="", encoding="utf-8-sig") as stream:
+                columns = set(next(csv.reader(stream), []))
+    except (OSError, ValueError, csv.Error):
+        return False  # some other file
+    return {"image", "role"} <= columns
 
 
 def read_photos(path: Path) -> tuple[list[Path], np.ndarray | None, str]:
@@ -77,7 +108,10 @@ def read_photos(path: Path) -> tuple[list[Path], np.ndarray | None, str]:
     photos = existing([path.parent / str(row["image"]) for row in rows], str(path))
     for kind, (first, second) in {"degrees": ("lat", "lon"), "utm": ("utm_east", "utm_north")}.items():
         if {first, second} <= rows[0].keys():
-            return photos, np.stack([_numbers(path, rows, first), _numbers(path, rows, second)], axis=1), kind
+            positions = np.stack([_numbers(path, rows, first), _numbers(path, rows, second)], axis=1)
+            if kind == "utm":
+                _in_metres(path, positions)
+            return photos, positions, kind
     return photos, None, "none"
 
 
@@ -106,15 +140,29 @@ def _numbers(path: Path, rows: list[dict[str, Any]], column: str) -> np.ndarray:
     return values
 
 
-def _positions(path: Path, rows: list[dict[str, Any]]) -> np.ndarray | None:
+def _in_metres(path: Path, positions: np.ndarray) -> tuple[str, ...]:
+    """Remarks about positions [n, 2] that should be metres; `DataError` where they are degrees."""
+    degrees = degrees_for_metres(positions)
+    if degrees == "yes":
+        raise DataError(
+            f"{path}: utm_east and utm_north hold degrees ({positions[0, 0]:g}, {positions[0, 1]:g} in row 1); "
+            "call the columns lon and lat, or give metres"
+        )
+    doubt = "utm_east and utm_north are small enough to be degrees; they are taken as metres"
+    return (doubt,) if degrees == "maybe" else ()
+
+
+def _positions(path: Path, rows: list[dict[str, Any]]) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """UTM positions [n, 2] of the rows, None where no columns tell them; and remarks about them."""
     if {"utm_east", "utm_north"} <= rows[0].keys():
-        return np.stack([_numbers(path, rows, "utm_east"), _numbers(path, rows, "utm_north")], axis=1)
+        positions = np.stack([_numbers(path, rows, "utm_east"), _numbers(path, rows, "utm_north")], axis=1)
+        return positions, _in_metres(path, positions)
     if {"lat", "lon"} <= rows[0].keys():
         try:
-            return to_utm(_numbers(path, rows, "lat"), _numbers(path, rows, "lon"))
+            return to_utm(_numbers(path, rows, "lat"), _numbers(path, rows, "lon")), ()
         except DataError as error:
             raise error if str(error).startswith(str(path)) else DataError(f"{path}, {error}") from error
-    return None
+    return None, ()
 
 
 def _listed(path: Path, database: list[dict[str, Any]], queries: list[dict[str, Any]]) -> list[np.ndarray]:

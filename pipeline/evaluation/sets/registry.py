@@ -112,16 +112,17 @@ ALIASES = {
 }
 
 
-def _key(name: str) -> str:
+def key(name: str) -> str:
+    """A name without case and punctuation, as names are compared."""
     return re.sub(r"[^a-z0-9*]", "", name.lower())
 
 
-_BY_KEY = {_key(name): name for name in SETS} | {_key(alias): name for alias, name in ALIASES.items()}
+_BY_KEY = {key(name): name for name in SETS} | {key(alias): name for alias, name in ALIASES.items()}
 
 
 def published_name(text: str) -> str | None:
     """The set's name in this table, however it is written (`Tokyo24/7`, `SVOX-Night`, `nordland**`); else None."""
-    return _BY_KEY.get(_key(text)) if not text.startswith((".", "/", "~")) else None
+    return _BY_KEY.get(key(text)) if not text.startswith((".", "/", "~")) else None
 
 
 def count_remark(name: str, split: str, database: int, queries: int) -> str | None:

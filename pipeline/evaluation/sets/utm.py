@@ -1,8 +1,8 @@
 """Positions: the field's `@UTM_east@UTM_north@...@.jpg` file names, and latitude and longitude to UTM metres.
 
 Invariant: file names are split at `@` and fields 1 and 2 are metres, whatever follows (common evaluators read no
-more); `to_utm` is Krueger's series to the sixth order on WGS84, better than a millimetre within 20 degrees of the
-central meridian (Karney, Transverse Mercator with an accuracy of a few nanometers, 2011, Eqs. 7-11 and 35).
+more); fields that hold degrees are refused, since every photo of a city lies within 25 "metres" of every other then.
+Conversions are PROJ's (`pyproj`), on WGS84.
 """
 
 from __future__ import annotations
@@ -13,21 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.common.errors import DataError
+from pipeline.common.text import shown
 
-AXIS = 6378137.0
-FLATTENING = 1 / 298.257223563
-SCALE = 0.9996
 WIDEST = 20.0  # degrees of longitude from the middle of a zone
-_N = FLATTENING / (2 - FLATTENING)
-# coefficients of n, n^2, ... n^6 for the harmonics 1 ... 6 (Karney 2011, Eq. 35)
-_ALPHA = (
-    (1 / 2, -2 / 3, 5 / 16, 41 / 180, -127 / 288, 7891 / 37800),
-    (0, 13 / 48, -3 / 5, 557 / 1440, 281 / 630, -1983433 / 1935360),
-    (0, 0, 61 / 240, -103 / 140, 15061 / 26880, 167603 / 181440),
-    (0, 0, 0, 49561 / 161280, -179 / 168, 6601661 / 7257600),
-    (0, 0, 0, 0, 34729 / 80640, -3418889 / 1995840),
-    (0, 0, 0, 0, 0, 212378941 / 319334400),
-)
+CITY = 2.0  # degrees: the photos of a city lie within so many; no set in metres is so small
 
 
 def file_position(path: Path) -> tuple[float, float] | None:
@@ -44,7 +33,8 @@ def file_position(path: Path) -> tuple[float, float] | None:
         east = north = float("nan")
     if not (np.isfinite(east) and np.isfinite(north)):
         raise DataError(
-            f"{path}: '@{fields[1]}@{fields[2]}' is no UTM position; names go @UTM_east@UTM_north@...@.jpg, in metres"
+            f"{shown(path)}: '@{shown(fields[1])}@{shown(fields[2])}' is no UTM position; "
+            "names go @UTM_east@UTM_north@...@.jpg, in metres"
         )
     return east, north
 
@@ -58,10 +48,29 @@ def file_positions(paths: Iterable[Path]) -> np.ndarray | None:
         return None
     if len(known) < len(found):
         raise DataError(
-            f"{paths[found.index(None)]}: this name carries no @UTM_east@UTM_north@ while others of the folder do; "
-            "rename it, or take it away"
+            f"{shown(paths[found.index(None)])}: this name carries no @UTM_east@UTM_north@ while others of the folder "
+            "do; rename it, or take it away"
         )
-    return np.array(known, np.float64).reshape(-1, 2)
+    positions = np.array(known, np.float64).reshape(-1, 2)
+    degrees = degrees_for_metres(positions, written=True)
+    if degrees == "yes" or (degrees == "maybe" and file_zone(paths[0])):
+        fields = paths[0].name.split("@")
+        raise DataError(
+            f"{shown(paths[0])}: '@{shown(fields[1])}@{shown(fields[2])}' looks like degrees; fields 1 and 2 of these "
+            "names are UTM east and north in metres. Write a manifest with the columns image, role, lat, lon instead"
+        )
+    return positions
+
+
+def position_remarks(paths: Iterable[Path], positions: np.ndarray) -> tuple[str, ...]:
+    """What a reader of a recall should know about positions [n, 2] in file names: doubtful units, several zones."""
+    found: list[str] = []
+    if degrees_for_metres(positions, written=True) == "maybe":
+        found.append("positions in the names are small enough to be degrees; they are taken as metres")
+    zones = sorted({zone for zone in map(file_zone, paths) if zone})
+    if len(zones) > 1:
+        found.append(f"names are of the UTM zones {', '.join(zones)}; distances across zones mean nothing")
+    return tuple(found)
 
 
 def file_zone(path: Path) -> str:
@@ -122,32 +131,37 @@ def to_utm(
             f"row {at + 1}: longitude {longitude[at]} is {abs(offset[at]):.0f} degrees from the middle of UTM zone "
             f"{zone}; make one set a region, or give utm_east and utm_north"
         )
-    phi, lam = np.radians(latitude), np.radians(offset)
-    e = np.sqrt(FLATTENING * (2 - FLATTENING))
-    tau = np.tan(phi)
-    sigma = np.sinh(e * np.arctanh(e * np.sin(phi)))
-    conformal = tau * np.hypot(1, sigma) - sigma * np.hypot(1, tau)
-    xi = np.arctan2(conformal, np.cos(lam))
-    eta = np.arcsinh(np.sin(lam) / np.hypot(conformal, np.cos(lam)))
-    powers = _N ** np.arange(1, 7)
-    east, north = eta.copy(), xi.copy()
-    for harmonic, coefficients in enumerate(_ALPHA, start=1):
-        alpha = float(np.dot(coefficients, powers))
-        north += alpha * np.sin(2 * harmonic * xi) * np.cosh(2 * harmonic * eta)
-        east += alpha * np.cos(2 * harmonic * xi) * np.sinh(2 * harmonic * eta)
-    radius = AXIS / (1 + _N) * (1 + _N**2 / 4 + _N**4 / 64 + _N**6 / 256)
+    from pyproj import Proj
+
     south = bool(np.median(latitude) < 0) if south is None else south
-    false_north = 10_000_000.0 if south else 0.0
-    return np.stack([500_000.0 + SCALE * radius * east, false_north + SCALE * radius * north], axis=1)
+    # the longitude counted from the zone's meridian, so that 359 and -1 are the same place
+    east, north = Proj(proj="utm", zone=zone, south=south, ellps="WGS84")(6 * zone - 183 + offset, latitude)
+    return np.stack([east, north], axis=1)
 
 
 def metres_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Great-circle distance in metres [n] between WGS84 (latitude, longitude) [n, 2] and [n, 2] (or [2]).
+    """Distance in metres [n] along the WGS84 ellipsoid between (latitude, longitude) [n, 2] and [n, 2] (or [2])."""
+    from pyproj import Geod
 
-    On the sphere of the mean radius (haversine): within 0.6 % of the ellipsoid's distance, anywhere on Earth.
-    """
-    a, b = np.radians(np.asarray(first, np.float64)), np.radians(np.asarray(second, np.float64))
-    half = np.sin((b - a) / 2) ** 2
-    chord = half[..., 0] + np.cos(a[..., 0]) * np.cos(b[..., 0]) * half[..., 1]
-    distance: np.ndarray = 2 * 6371008.8 * np.arcsin(np.sqrt(np.clip(chord, 0, 1)))
+    a, b = np.broadcast_arrays(np.asarray(first, np.float64), np.asarray(second, np.float64))
+    distance: np.ndarray = np.asarray(Geod(ellps="WGS84").inv(a[..., 1], a[..., 0], b[..., 1], b[..., 0])[2])
     return distance
+
+
+def degrees_for_metres(positions: np.ndarray, written: bool = False) -> str:
+    """Whether positions [n, 2] that should be metres look like longitude and latitude: "yes", "maybe" or "no".
+
+    "yes": all lie in the range of degrees, not all are whole numbers, and they span less than two degrees, or, where
+    they were `written` in file names (UTM metres are written with two decimals), most have more than two decimals.
+    "maybe": in that range, but as far apart as a small local frame in metres could be.
+    """
+    values = np.abs(np.asarray(positions, np.float64).reshape(-1, 2))
+    values = values[~np.isnan(values).any(axis=1)]
+    if len(values) == 0 or (values == np.round(values)).all():
+        return "no"  # numbers of frames, which some downloads write there, are whole
+    if not (values.max(axis=0) <= [180, 90]).all() and not (values.max(axis=0) <= [90, 180]).all():
+        return "no"
+    if np.ptp(positions, axis=0).max() < CITY:
+        return "yes"
+    fine = np.abs(values - np.round(values, 2)).max(axis=1) > 1e-9
+    return "yes" if written and fine.mean() > 0.5 else "maybe"

@@ -41,7 +41,7 @@ def test_blocks_of_any_size_give_the_same(monkeypatch: pytest.MonkeyPatch) -> No
     random = np.random.default_rng(1)
     database, queries = random.uniform(0, 500, (700, 2)), random.uniform(-100, 600, (150, 2))
     whole = within_radius(database, queries, 25.0)
-    monkeypatch.setattr(ground_truth, "PAIRS_AT_A_TIME", 3)
+    monkeypatch.setattr(ground_truth, "QUERIES_AT_A_TIME", 7)
     assert all(np.array_equal(a, b) for a, b in zip(whole, within_radius(database, queries, 25.0), strict=True))
     assert [rows.tolist() for rows in whole] == brute_force(database, queries, 25.0)
 

@@ -76,8 +76,11 @@ def test_any_folder_by_its_path(tmp_path: Path, part: str) -> None:
 def test_sequences_without_positions_need_frames(tmp_path: Path) -> None:
     for side in ("database", "queries"):
         touch(tmp_path / side, [f"frame{i:02d}.png" for i in range(5)])
-    with pytest.raises(DataError, match=r"frame00\.png: no position in this name; name images @UTM_east"):
-        load_set(str(tmp_path), EvaluationConfig())
+    bare = load_set(str(tmp_path), EvaluationConfig())
+    assert not bare.has_ground_truth and "answers are shown, not scored; to score them, name images" in bare.remarks[0]
+    touch(tmp_path / "pitts30k" / "test" / "database", ["a.jpg"]), touch(tmp_path / "pitts30k/test/queries", ["b.jpg"])
+    with pytest.raises(DataError, match=r"a\.jpg: no position in this name; name images @UTM_east"):
+        load_set("pitts30k", config(tmp_path))
     loaded = load_set(str(tmp_path), EvaluationConfig(frames=1))
     assert (rows(loaded)[:2], loaded.rule) == ([[0, 1], [0, 1, 2]], "+-1 frames")
     (tmp_path / "queries" / "frame04.png").unlink()

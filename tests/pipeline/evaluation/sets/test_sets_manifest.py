@@ -105,3 +105,9 @@ def test_missing_photos_columns_and_files(tmp_path: Path) -> None:
     (tmp_path / "broken.parquet").write_bytes(b"not parquet")
     with pytest.raises(DataError, match=r"not a readable \.parquet table"):
         load(tmp_path / "broken.parquet")
+
+
+def test_degrees_in_columns_of_metres_are_refused(tmp_path: Path) -> None:
+    path = manifest(tmp_path, ".csv", utm_east=[2.35, 2.36, 2.37, 2.35, 2.36], utm_north=[48.85] * 5)
+    with pytest.raises(DataError, match=r"utm_east and utm_north hold degrees \(2\.35, 48\.85 in row 1\)"):
+        load(path)

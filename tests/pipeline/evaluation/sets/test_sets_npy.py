@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import os
 import pickle
@@ -12,7 +13,8 @@ import pytest
 
 from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.sets.load import load_set
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
+from pipeline.evaluation.sets.load import available, load_set
 from pipeline.evaluation.sets.npy_lists import read_indices, read_ragged, read_strings
 
 
@@ -171,7 +173,7 @@ def test_several_lists_in_a_folder_go_by_split(tmp_path: Path) -> None:
         write_lists(tmp_path, f"pitts30k_{split}", ["a.jpg"], [f"{split}.jpg"], tmp_path)
         save(tmp_path / f"pitts30k_{split}_gt.npy", ragged([[0]]))
     assert load_set(str(tmp_path), EvaluationConfig(split="val")).queries[0].name == "val.jpg"
-    with pytest.raises(UsageError, match="name one file"):
+    with pytest.raises(UsageError, match="give one file instead: pitts30k_test_dbImages"):
         load_set(str(tmp_path), EvaluationConfig(split="train"))
     (tmp_path / "pitts30k_val_gt.npy").unlink()
     with pytest.raises(DataError, match=r"pitts30k_val_gt\.npy: no ground truth"):
@@ -182,3 +184,86 @@ def test_real_lists_are_what_numpy_reads(shared_dir: Path) -> None:
     for name in ("msls_val/msls_val_pIdx.npy", "Nordland/Nordland_gt.npy"):
         path = shared_dir / "data" / "ground_truth" / name
         assert all(map(np.array_equal, read_ragged(path), np.load(path, allow_pickle=True)))
+
+
+def answers(evaluated: EvaluationSet) -> tuple[list[str], list[str], list[list[int]]]:
+    """What a set asks, searches and accepts."""
+    return [q.name for q in evaluated.queries], [d.name for d in evaluated.database], [
+        p.tolist() for p in evaluated.positives]  # fmt: skip
+
+
+@pytest.mark.parametrize("folders", [("database", "queries"), ("ref", "query"), ("new", "old"), ("gallery", "queries")])
+@pytest.mark.parametrize("names", [("dbImages", "qImages", "gt"), ("ref_image_names", "query_image_names", "gt_25m")])
+def test_a_folder_and_one_of_its_lists_are_the_same_set(
+    tmp_path: Path, folders: tuple[str, str], names: tuple[str, str, str]
+) -> None:
+    """Photos that the folders hold and the lists leave out; positives that no radius gives."""
+    sides = [[f"{folder}/@{i * 100}.00@{at}.00@.jpg" for i in range(8)] for at, folder in enumerate(folders)]
+    write_lists(tmp_path, "walk_val", sides[0], sides[1], tmp_path)
+    for file in tmp_path.glob("*.npy"):
+        file.unlink()
+    np.save(tmp_path / f"walk_val_{names[0]}.npy", np.array(sides[0][::-1]))
+    np.save(tmp_path / f"walk_val_{names[1]}.npy", np.array(sides[1][:4]))
+    save(tmp_path / f"walk_val_{names[2]}.npy", ragged([[0, 1], [2], [3], []]))
+    whole = answers(load_set(str(tmp_path), EvaluationConfig()))
+    assert len(whole[0]) == 4 and whole[2] == [[0, 1], [2], [3], []]
+    for what in names:
+        assert answers(load_set(str(tmp_path / f"walk_val_{what}.npy"), EvaluationConfig())) == whole
+
+
+def test_a_folder_and_its_manifest_are_the_same_set(tmp_path: Path) -> None:
+    for side, role in (("database", 0), ("queries", 1)):
+        (tmp_path / side).mkdir()
+        for i in range(3):
+            (tmp_path / side / f"@{i * 100}.50@{role}.25@.jpg").touch()
+    manifest = tmp_path / "set.csv"
+    manifest.write_text("image,role,frame\ndatabase/@0.50@0.25@.jpg,database,0\nqueries/@200.50@1.25@.jpg,query,0\n")
+    assert answers(load_set(str(tmp_path), EvaluationConfig())) == answers(load_set(str(manifest), EvaluationConfig()))
+    (tmp_path / "again.csv").write_text(manifest.read_text())
+    with pytest.raises(UsageError, match=r"again\.csv, set\.csv are all manifests; give one of the files"):
+        load_set(str(tmp_path), EvaluationConfig())
+
+
+def test_tables_beside_folders_that_are_not_read_are_named(tmp_path: Path) -> None:
+    for side in ("database", "queries"):
+        (tmp_path / "images" / "test" / side).mkdir(parents=True)
+        (tmp_path / "images" / "test" / side / "@583400.00@4477100.00@.jpg").touch()
+    write_lists(tmp_path, "city_val", ["a.jpg"], ["b.jpg"], tmp_path)
+    (tmp_path / "truth.npz").touch(), (tmp_path / "._truth.npz").touch()
+    (remark,) = load_set(str(tmp_path), EvaluationConfig()).remarks
+    assert remark == "not read: city_val_dbImages.npy, city_val_qImages.npy, truth.npz; the folders decide"
+
+
+def test_the_validation_folders_of_openvprlab(tmp_path: Path) -> None:
+    pitts, msls = tmp_path / "pitts30k-val", tmp_path / "msls-val"
+    write_lists(pitts, "pitts30k_val", ["000/a.jpg", "000/b.jpg"], ["q/1.jpg"], pitts)
+    save(pitts / "pitts30k_val_gt_25m.npy", ragged([[1]]))
+    write_lists(msls, "msls_val", ["cph/database/a.jpg", "sf/database/b.jpg"], ["sf/query/1.jpg"], msls)
+    for old, new in (("dbImages", "ref_image_names"), ("qImages", "query_image_names")):
+        (msls / f"msls_val_{old}.npy").rename(msls / f"msls_val_{new}.npy")
+    save(msls / "msls_val_ground_truth_25m.npy", ragged([[1]]))
+    config = EvaluationConfig(root=str(tmp_path))
+    for name in ("msls_val", "msls-val", str(msls)):
+        assert answers(load_set(name, config)) == (["1.jpg"], ["a.jpg", "b.jpg"], [[1]])
+        assert any("published are 18,871 and 740" in remark for remark in load_set(name, config).remarks)
+    for name in ("pitts30k-val", str(pitts)):
+        loaded = load_set(name, config)
+        assert answers(loaded) == (["1.jpg"], ["a.jpg", "b.jpg"], [[1]]) and loaded.rule == "25 m"
+    assert load_set("pitts30k", dataclasses.replace(config, split="val")).name == "pitts30k"
+    with pytest.raises(DataError, match=r"pitts30k is not there: expected .*pitts30k"):
+        load_set("pitts30k", config)  # the lists are those of the validation split
+    there = {entry.name for entry in available(str(tmp_path)) if entry.folder is not None}
+    assert there == {"msls_val"}
+    other = load_set(str(pitts), dataclasses.replace(config, radius=10.0))
+    assert other.rule == "25 m" and "radius=10 does not apply" in other.remarks[0]
+
+
+@pytest.mark.parametrize("name", ["../../etc/passwd", "/etc/passwd", "a/../../b.jpg", "nul\0.jpg", ""])
+def test_a_list_names_nothing_outside_its_folder(tmp_path: Path, name: str) -> None:
+    write_lists(tmp_path, "s", ["a.jpg"], ["b.jpg"], tmp_path)
+    save(tmp_path / "s_gt.npy", ragged([[0]]))
+    np.save(tmp_path / "s_qImages.npy", np.array([f"{name}", "b.jpg"]) if name else np.array(["", "b.jpg"]))
+    if "\0" in name:  # numpy drops a NUL at the end of a text alone
+        assert np.load(tmp_path / "s_qImages.npy")[0] == name
+    with pytest.raises(DataError, match="is no plain path relative to the photos' folder"):
+        load_set(str(tmp_path), EvaluationConfig())

@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 
 from pipeline.common.errors import DataError
-from pipeline.evaluation.sets.utm import file_position, file_positions, to_utm, utm_zone
+from pipeline.evaluation.sets.utm import (
+    degrees_for_metres,
+    file_position,
+    file_positions,
+    metres_between,
+    position_remarks,
+    to_utm,
+    utm_zone,
+)  # fmt: skip
 
 
 def test_names_are_read_as_common_evaluators_read_them() -> None:
@@ -112,3 +120,57 @@ def test_real_metadata_agrees(shared_dir: Path) -> None:
         theirs = np.array([[float(row["utm_east"]), float(row["utm_north"])] for row in rows])
         assert utm_zone(float(np.median(lat)), float(np.median(lon))) == zone
         assert np.abs(to_utm(lat, lon) - theirs).max() < 1.2, city
+
+
+def names(values: list[tuple[object, object]], zone: str = "") -> list[Path]:
+    return [Path(f"@{a}@{b}@{zone}@@@@@.jpg") for a, b in values]
+
+
+CITIES = {
+    "longitude first": [(2.3522, 48.8566), (2.3601, 48.8500)],
+    "latitude first": [(48.8566, 2.3522), (48.8500, 2.3601)],
+    "west and south": [(-122.4194, -37.7749), (-122.4000, -37.7800)],
+    "two decimals, padded": [("0000002.35", "0000048.86"), ("0000002.36", "0000048.85")],
+    "a region, five decimals": [(2.35222, 48.85661), (13.40495, 52.52001)],
+}
+
+
+@pytest.mark.parametrize("kind", CITIES)
+def test_degrees_in_the_fields_of_metres_are_refused(kind: str) -> None:
+    with pytest.raises(DataError, match=r"looks like degrees; fields 1 and 2 .* are UTM east and north in metres"):
+        file_positions(names(CITIES[kind]))
+
+
+def test_metres_are_no_degrees() -> None:
+    for values in (
+        [(0, 0), (0, 24), (0, 48)],  # frames, as downloads of Nordland write them
+        [("0583405.12", "4477100.50"), ("0583400.00", "4477100.00")],
+        [(0.5, 10.25), (300.0, 20.0)],  # a local frame
+        [(-0.5, 91.0), (0.25, 220.5)],
+    ):
+        assert file_positions(names(values)) is not None and not position_remarks([], file_positions(names(values)))
+    small = [(12.5, 3.25), (40.25, 70.0)]  # a local frame that could be degrees far apart: taken, and told
+    positions = file_positions(names(small))
+    assert positions is not None and "small enough to be degrees" in position_remarks([], positions)[0]
+    with pytest.raises(DataError, match="looks like degrees"):  # a zone in the name: UTM, and no UTM is so small
+        file_positions(names(small, "31@N"))
+    assert degrees_for_metres(np.full((2, 2), np.nan)) == "no"
+
+
+def test_zones_that_differ_are_told() -> None:
+    files = [Path("@583405.12@4477100.50@17@T@.jpg"), Path("@183405.12@4477100.50@18@T@.jpg")]
+    assert position_remarks(files, np.array([[583405.12, 4477100.5], [183405.12, 4477100.5]])) == (
+        "names are of the UTM zones 17N, 18N; distances across zones mean nothing",
+    )
+
+
+def test_longitudes_beyond_180_and_poles() -> None:
+    assert to_utm(np.array([52.0]), np.array([359.0]), 31)[0] == pytest.approx(to_utm([52.0], [-1.0], 31)[0])  # type: ignore[arg-type]
+    assert np.isfinite(to_utm(np.array([90.0, -90.0]), np.array([9.0, 9.0]), 32)).all()
+
+
+def test_distances_follow_the_ellipsoid() -> None:
+    quarter = metres_between(np.array([[0.0, 0.0]]), np.array([0.0, 90.0]))
+    assert quarter == pytest.approx(math.pi / 2 * 6378137.0, abs=1e-3)
+    flinders, buninyong = np.array([-37.951033417, 144.424867889]), np.array([-37.652821139, 143.926495528])
+    assert metres_between(flinders, buninyong) == pytest.approx(54_972.271, abs=1.5)
