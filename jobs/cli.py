@@ -1,8 +1,8 @@
 """One way to start a job: typed dataclass -> YAML file + command-line overrides, errors as one line, exit codes.
 
-jsonargparse reads `--config FILE` and then the options in order, and checks both against the types. The list of options
-and `--help` are made here, from the dataclass alone, so that `--help` needs none of it. An option's name is its YAML
-key, `--data.places_per_batch`; dashes are read as underscores.
+The list of options and `--help` are made from the dataclass alone. An option's name is its YAML key,
+`--data.places_per_batch`; dashes are read as underscores. A word means the same in a file and as an option: the
+setting's own type reads it (`pipeline.config.words`), and its range is checked when the dataclass is built.
 
 Exit codes: 0 done, 2 usage or configuration, 3 data, 4 diverged, 75 preempted and saved (`pipeline.common.errors`),
 130 interrupted.
@@ -13,20 +13,20 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import inspect
-import json
 import os
-import re
 import shutil
 import sys
 import textwrap
-import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn, TypeVar
 
 from pipeline.common.errors import UsageError, UserError
-from pipeline.config import RunConfig
+from pipeline.common.text import shown
+from pipeline.config import RunConfig, from_dict
+from pipeline.config.setting import alternatives, is_section, nearest, present_name, shortened, type_hints
+from pipeline.config.words import from_text, read_config
 
 Config = TypeVar("Config")
 
@@ -62,12 +62,13 @@ def parse(
     Args:
         kind: the dataclass; nested dataclasses become dotted options.
         description: first lines of `--help`; indented lines are examples and stay as they are.
-        argv: arguments, `sys.argv[1:]` by default. A bool field is a switch; a tuple may be given as `a,b`.
+        argv: arguments, `sys.argv[1:]` by default. A bool field is a switch; a tuple may be given as `a,b`;
+            `none` is None.
         config_file: whether `--config FILE` (YAML) is accepted; later options override it.
         program: name in the usage line; none: that of the job.
 
     Raises:
-        UsageError: an unknown key (with the nearest known one), a value of the wrong type, a missing file.
+        UsageError: an unknown key (with the nearest known one), a value outside its type or range, a missing file.
         SystemExit: after `--help`.
     """
     words = list(sys.argv[1:] if argv is None else argv)
@@ -75,19 +76,14 @@ def parse(
     if "-h" in words or "--help" in words:
         print(help_text(program or program_name(), description, known, config_file))
         raise SystemExit(0)
-    words = _normalise(words, {o.name: o.hint for o in known}, _groups(kind) | ({"config"} if config_file else set()))
-    from jsonargparse import ArgumentParser
-
-    class Parser(ArgumentParser):
-        def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-            raise UsageError(_readable(message, [o.name for o in known]))
-
-    parser = Parser(prog=program_name(), default_env=False, add_help=False)
-    if config_file:
-        parser.add_argument("--config", action="config")
-    parser.add_class_arguments(kind, as_group=True)
-    built = parser.instantiate(parser.parse_args(words))
-    return kind(**{key: value for key, value in vars(built).items() if key != "config"})
+    hints = {o.name: o.hint for o in known} | ({"config": str} if config_file else {})
+    values: dict[str, Any] = {}
+    for name, text in _pairs(kind, words, hints):
+        given = _flat(kind, read_config(text), text, list(hints)) if name == "config" else [(name, text)]
+        for setting, value in given:
+            _put(values, setting, from_text(hints[setting], value))
+    built: Config = from_dict(kind, values)
+    return built
 
 
 def parse_part(parts: Mapping[str, type], description: str, argv: Sequence[str] | None = None) -> tuple[str, Any]:
@@ -195,31 +191,15 @@ def _docs(kind: type) -> dict[str, str]:
     return {p.arg_name: " ".join((p.description or "").split()) for p in parse_from_object(kind).params}
 
 
-def _groups(kind: type, prefix: str = "") -> set[str]:
-    """Dotted names of the nested dataclasses."""
-    found: set[str] = set()
-    for name, hint in typing.get_type_hints(kind).items():
-        if dataclasses.is_dataclass(hint):
-            found |= {prefix + name} | _groups(typing.cast(type, hint), f"{prefix}{name}.")
-    return found
-
-
 def _entry(left: str, doc: str, width: int) -> list[str]:
     wrapped = textwrap.wrap(doc, width - 30) or [""]
     first = [f"  {left}"] if len(left) > 26 else [f"  {left:<27} {wrapped.pop(0)}"]
     return first + [" " * 30 + line for line in wrapped]
 
 
-def _plain(hint: Any) -> Any:
-    """The type without `| None`."""
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return next(part for part in typing.get_args(hint) if part is not types.NoneType)
-    return hint
-
-
 def _metavar(hint: Any) -> str:
     """What stands after an option in `--help`: nothing for a switch, N, X, TEXT, {a,b} or A,B,..."""
-    hint = _plain(hint)
+    hint = alternatives(hint)[0]
     if typing.get_origin(hint) is Literal:
         return "{" + ",".join(map(str, typing.get_args(hint))) + "}"
     if typing.get_origin(hint) is tuple:
@@ -239,50 +219,58 @@ def _shown(value: Any) -> str | None:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _normalise(argv: Sequence[str], hints: Mapping[str, Any], groups: set[str]) -> list[str]:
-    """Pairs of option and value: `--max-bad` becomes `--max_bad`, a switch gets `true`, `a,b` becomes `["a", "b"]`.
+def _pairs(kind: type, argv: Sequence[str], hints: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """(setting, text) of each option: `--max-bad 1` is max_bad, a switch is `true`, a former name is today's.
 
     Raises:
-        UsageError: an option that does not exist, or a value without an option.
+        UsageError: an option that does not exist, one without a value, or a value without an option.
     """
-    words: list[str] = []
-    for word in argv:
+    pairs: list[tuple[str, str]] = []
+    words = list(argv)
+    while words:
+        word = words.pop(0)
         if not word.startswith("--"):
-            if not words or not words[-1].startswith("--"):
-                raise UsageError(f"'{word}' stands without an option; write --NAME {word}")
-            words.append(_listed(word, hints.get(words[-1][2:])))
-            continue
-        if words and hints.get(words[-1][2:]) is bool:
-            words.append("true")
+            raise UsageError(f"'{shown(word)}' stands without an option; write --NAME {shown(word)}")
         name, equals, value = word[2:].partition("=")
-        name = name.replace("-", "_")
-        if name not in hints and name not in groups:
-            raise UsageError(f"there is no option --{name}{_nearest(name, [*hints, *groups])}")
-        words += [f"--{name}", _listed(value, hints.get(name))] if equals else [f"--{name}"]
-    if words and hints.get(words[-1][2:]) is bool:
-        words.append("true")
-    return words
+        name = present_name(kind, name.replace("-", "_"))
+        if name not in hints:
+            raise UsageError(f"there is no option --{shown(name)}{_nearest(name, list(hints))}")
+        if not equals and words and not words[0].startswith("--"):
+            value = words.pop(0)
+        elif not equals and hints[name] is bool:
+            value = "true"
+        elif not equals:
+            raise UsageError(f"--{name} needs a value")
+        pairs.append((name, value))
+    return pairs
 
 
-def _listed(value: str, hint: Any) -> str:
-    """`a,b` of a tuple option as a YAML list."""
-    if typing.get_origin(hint) is not tuple or value.startswith("["):
-        return value
-    items = [item for item in value.split(",") if item]
-    return "[" + ", ".join(items if int in typing.get_args(hint) else map(json.dumps, items)) + "]"
+def _flat(
+    kind: type, values: Mapping[str, Any], file: str, known: list[str], where: str = ""
+) -> Iterator[tuple[str, Any]]:
+    """(setting, words) of all settings in a file."""
+    hints = type_hints(kind)
+    for given, value in values.items():
+        name = present_name(kind, given)
+        if name not in hints:
+            told = where + given
+            raise UsageError(f"{file}: there is no setting {shown(told)}{_nearest(told, known)}")
+        if not is_section(hints[name]):
+            yield where + name, value
+        elif isinstance(value, dict):
+            yield from _flat(hints[name], value, file, known, f"{where}{name}.")
+        elif value != "":  # a section with nothing in it
+            raise UsageError(f"{file}: {where}{name} is a section with settings of its own, not {shortened(value)}")
 
 
-def _nearest(word: str, known: Sequence[str]) -> str:
+def _put(values: dict[str, Any], name: str, value: Any) -> None:
+    *sections, last = name.split(".")
+    for section in sections:
+        values = values.setdefault(section, {})
+    values[last] = value
+
+
+def _nearest(word: str, known: list[str]) -> str:
     """` (did you mean 'train.lr'?)`, or nothing."""
-    last = word.rsplit(".", 1)[-1]
-    near = [name for name in known if name.rsplit(".", 1)[-1] == last]  # right name, wrong or no section
-    near = near or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    near = near or [n for n in known if difflib.get_close_matches(last, [n.rsplit(".", 1)[-1]], cutoff=0.7)]
-    return f" (did you mean '{near[0]}'?)" if near and near[0] != word else ""
-
-
-def _readable(message: str, known: Sequence[str]) -> str:
-    """One line of the parser's message, with the nearest known name where a key is unknown."""
-    line = " ".join(message.split())
-    unknown = re.search(r"(?:unrecognized arguments: --|[Kk]ey '|option ')([\w.-]+)", line)
-    return line + (_nearest(unknown.group(1), known) if unknown else "")
+    near = nearest(word, known)
+    return f" (did you mean '{near}'?)" if near else ""

@@ -18,182 +18,201 @@ from pipeline.config.model import BackboneConfig as BackboneConfig
 from pipeline.config.model import CrossImageConfig as CrossImageConfig
 from pipeline.config.model import ModelConfig as ModelConfig
 from pipeline.config.model import PoolingConfig as PoolingConfig
+from pipeline.config.setting import (
+    OnResume,
+    SettingError,
+    Settings,
+    check,
+    is_section,
+    present_name,
+    setting,
+    shortened,
+    type_hints,
+    unknown,
+)
+
+MANY = 1024  # processes, or batches ahead, that no machine needs
+SEEDS = 2**31 - 1  # the largest seed: a step's own seed has it in its upper half
+MONTH = 2_592_000  # seconds
+UNLESS_COSINE: OnResume = "free unless train.schedule=cosine"  # whose rate follows the length of the run
 
 
 @dataclass(frozen=True)
-class DataConfig:
+class DataConfig(Settings):
     """What is trained on, in which order, and how images are prepared."""
 
-    shards: tuple[str, ...] | str = "data/shards"
+    shards: tuple[str, ...] | str = setting("data/shards", changes="numbers", resume="free")
     """Folder, or any fsspec URL, of a shard set made by jobs.prepare; or a list, `[a, b]`: one training over all."""
-    shard_weights: tuple[float, ...] = ()
+    shard_weights: tuple[float, ...] = setting((), changes="numbers", above=0, may_be_empty=True)
     """How often a place of each set comes in an epoch, above 0: 0.5 half of the places, 2 each twice (never in one
     batch); empty: 1 for each set."""
-    places_per_batch: int = 72
+    places_per_batch: int = setting(72, changes="numbers", at_least=1)
     """Places in the global batch, over all ranks; four images each (paper: 72, so 288 images)."""
-    order: Literal["city", "mixed", "blocked"] = "city"
+    order: Literal["city", "mixed", "blocked"] = setting("city", changes="numbers")
     """Order of places: in-city batches (as published in effect), mixed over cities, or within windows of shards."""
-    window_shards: int = 8
+    window_shards: int = setting(8, changes="numbers", at_least=1)
     """Shards read together by order=blocked."""
-    image_size: int = 224
+    image_size: int = setting(224, changes="numbers", at_least=1, at_most=8192)
     """Side of the square input, in pixels; a multiple of the patch size (paper: 224)."""
-    augment: Literal["rand", "light", "off"] = "rand"
+    augment: Literal["rand", "light", "off"] = setting("rand", changes="numbers")
     """RandAugment as published; a light colour jitter and crop; or nothing."""
-    rand_ops: int = 3
+    rand_ops: int = setting(3, changes="numbers", at_least=0, at_most=16)
     """RandAugment: operations an image (paper: 3)."""
-    rand_magnitude: int = 9
+    rand_magnitude: int = setting(9, changes="numbers", at_least=0, at_most=30)
     """RandAugment: magnitude out of 30 (published: 9)."""
-    workers: int = 4
+    workers: int = setting(4, changes="speed", at_least=0, at_most=MANY)
     """Decoding processes a rank; 0 decodes in the training process."""
-    prefetch: int = 2
+    prefetch: int = setting(2, changes="speed", at_least=1, at_most=MANY)
     """Batches each worker prepares ahead."""
-    cache: str = "data/cache"
+    cache: str = setting("data/cache", changes="none")
     """Local folder for shards fetched from a URL."""
-    cache_gb: float = 50.0
+    cache_gb: float = setting(50.0, changes="speed", above=0)
     """Bound of that cache in GB (10^9 bytes)."""
 
 
 @dataclass(frozen=True)
-class LossConfig:
+class LossConfig(Settings):
     """Multi-similarity loss with online mining (paper, Eq. 5)."""
 
-    alpha: float = 1.0
+    alpha: float = setting(1.0, changes="numbers", above=0)
     """Weight of positives (paper: 1)."""
-    beta: float = 50.0
+    beta: float = setting(50.0, changes="numbers", above=0)
     """Weight of negatives (paper: 50)."""
-    base: float = 0.0
+    base: float = setting(0.0, changes="numbers", at_least=-1, at_most=1)
     """The similarity threshold lambda (paper: 0)."""
-    margin: float = 0.1
+    margin: float = setting(0.1, changes="numbers", at_least=0, at_most=2)
     """Mining margin (paper: 0.1)."""
-    ignore_within: float = 0.0
+    ignore_within: float = setting(0.0, changes="numbers", at_least=0)
     """Pairs of different places closer than this many metres are neither positive nor negative; 0: none (published)."""
 
 
 @dataclass(frozen=True)
-class EvaluationConfig:
+class EvaluationConfig(Settings):
     """Which sets are searched, under which protocols. A recall means nothing without these."""
 
-    sets: tuple[str, ...] = ()
+    sets: tuple[str, ...] = setting((), changes="numbers", may_be_empty=True)
     """Folders of evaluation sets, `<dataset>/images/<split>/{database,queries}`, or a set's name under `root`."""
-    root: str = "data"
+    root: str = setting("data", changes="numbers")
     """Folder under which set names are looked up."""
-    split: Literal["train", "val", "test"] = "test"
+    split: Literal["train", "val", "test"] = setting("test", changes="numbers")
     """Split of the folder layout."""
-    groups: tuple[Literal["single", "shuffled", "ordered"], ...] = ("single", "shuffled", "ordered")
+    groups: tuple[Literal["single", "shuffled", "ordered"], ...] = setting(
+        ("single", "shuffled", "ordered"), changes="numbers"
+    )
     """Which images share an inference batch: each alone, seeded random groups, or neighbours in file order (the
     paper's way)."""
-    group_size: int = 16
+    group_size: int = setting(16, changes="numbers", at_least=1)
     """Images a group for shuffled and ordered (paper: 16; 8 on Pittsburgh)."""
-    group_seed: int = 0
+    group_seed: int = setting(0, changes="numbers", at_least=0, at_most=SEEDS)
     """Seed of the shuffled grouping."""
-    recalls: tuple[int, ...] = (1, 5, 10, 20)
+    recalls: tuple[int, ...] = setting((1, 5, 10, 20), changes="numbers", at_least=1, at_most=10_000)
     """The N of Recall@N."""
-    radius: float = 25.0
+    radius: float = setting(25.0, changes="numbers", at_least=0, at_most=100_000)
     """Metres within which a database image is a positive, inclusive (paper: 25)."""
-    frames: int | None = None
+    frames: int | None = setting(None, changes="numbers", at_least=0)
     """For sequences without positions: positives are +- this many frames instead of metres."""
-    without_positives: Literal["miss", "drop"] = "miss"
+    without_positives: Literal["miss", "drop"] = setting("miss", changes="numbers")
     """Queries that have no positive count as a miss, or are dropped (MSLS's own tool)."""
-    resize: Literal["antialias", "published"] = "antialias"
+    resize: Literal["antialias", "published"] = setting("antialias", changes="numbers")
     """antialias: resize as in training, then normalise; published: normalise, then resize without antialias."""
-    pca: int | None = None
+    pca: int | None = setting(None, changes="numbers", at_least=1)
     """Dimensions kept by PCA; none keeps all (paper: 4096)."""
-    batch: int = 32
+    batch: int = setting(32, changes="speed", at_least=1, at_most=65_536)
     """Images a forward pass of the per-image part; memory only, never the result."""
-    workers: int = 4
+    workers: int = setting(4, changes="speed", at_least=0, at_most=MANY)
     """Decoding processes a rank; 0 decodes in the evaluating process."""
-    precision: Literal["fp32", "bf16", "fp16"] = "fp32"
+    precision: Literal["fp32", "bf16", "fp16"] = setting("fp32", changes="numbers")
     """Autocast of the per-image part; the cross-image encoder and the search stay in fp32."""
-    store: Literal["none", "fp32", "fp16"] = "none"
+    store: Literal["none", "fp32", "fp16"] = setting("none", changes="numbers")
     """Keep descriptors as Parquet under the output folder, in this type; they are reused when nothing changed."""
-    pca_from: str | None = None
+    pca_from: str | None = setting(None, changes="numbers")
     """Set whose database PCA is fitted on, at most 16,384 images (paper: Pitts30k train); none: each set's own."""
-    pca_whiten: bool = False
+    pca_whiten: bool = setting(False, changes="numbers")
     """Scale PCA's directions to unit variance (published: no)."""
-    search: Literal["exact", "ivfpq", "hnsw"] = "exact"
+    search: Literal["exact", "ivfpq", "hnsw"] = setting("exact", changes="numbers")
     """Exact L2 search, or a faiss approximation for large sets, whose recall against exact is measured and printed."""
-    rerank: int = 0
+    rerank: int = setting(0, changes="numbers", at_least=0, at_most=10_000)
     """Second stage: this many first candidates are put in order by matching patch tokens in space; 0: none. Reads the
     candidates' images again; not for validation during training."""
-    rerank_layer: int | None = None
+    rerank_layer: int | None = setting(None, changes="numbers", at_least=1)
     """Block (transformer) or stage (ResNet, VGG) of the backbone whose patches are matched, from 1; none: its last."""
 
 
 @dataclass(frozen=True)
-class TrainConfig:
+class TrainConfig(Settings):
     """Optimisation, checkpoints and stopping."""
 
-    epochs: int = 10
+    epochs: int = setting(10, changes="numbers", at_least=1, resume=UNLESS_COSINE)
     """Epochs over the plan (paper: 10)."""
-    steps: int | None = None
+    steps: int | None = setting(None, changes="numbers", at_least=1, resume=UNLESS_COSINE)
     """Stop after this many steps, whatever the epochs; none: no limit."""
-    optimizer: Literal["adam", "adamw", "sgd"] = "adam"
+    optimizer: Literal["adam", "adamw", "sgd"] = setting("adam", changes="numbers")
     """Optimiser (paper: Adam)."""
-    lr: float = 1e-4
+    lr: float = setting(1e-4, changes="numbers", above=0)
     """Learning rate (paper: 1e-4)."""
-    weight_decay: float = 0.0
+    weight_decay: float = setting(0.0, changes="numbers", at_least=0)
     """Weight decay (published: 0)."""
-    schedule: Literal["step", "cosine", "constant"] = "step"
+    schedule: Literal["step", "cosine", "constant"] = setting("step", changes="numbers")
     """step halves the rate every `step_epochs` (paper); cosine decays to 0; both stepped per iteration."""
-    step_epochs: float = 3.0
+    step_epochs: float = setting(3.0, changes="numbers", above=0)
     """schedule=step: epochs between two reductions (paper: 3)."""
-    step_factor: float = 0.5
+    step_factor: float = setting(0.5, changes="numbers", above=0, at_most=1)
     """schedule=step: factor of a reduction (paper: 0.5)."""
-    warmup_steps: int = 0
+    warmup_steps: int = setting(0, changes="numbers", at_least=0)
     """Linear warm-up in steps (published: 0)."""
-    max_grad_norm: float | None = None
+    max_grad_norm: float | None = setting(None, changes="numbers", above=0, formerly="clip")
     """Largest norm of the gradient; none: no clipping (published: none)."""
-    passes: Literal["group", "joint"] = "group"
+    passes: Literal["group", "joint"] = setting("group", changes="numbers")
     """group: each image is described in the global batch (paper). joint (ours): from the same regions also alone, and
     one loss is taken over both descriptions of all images, so that the weights also serve a single photo. The backbone
     runs once; needs a cross-image encoder."""
-    validate_first: bool = True
+    validate_first: bool = setting(True, changes="none")
     """Evaluate the untrained model before the first step, so that a run shows what training added."""
-    patience: int = 3
+    patience: int = setting(3, changes="numbers", at_least=0, resume="free")
     """Stop after this many epochs without a better validation R@5 (paper: 3); 0 never stops early."""
-    encode_chunk: int | None = None
+    encode_chunk: int | None = setting(None, changes="speed", at_least=1)
     """Images encoded at a time on a rank, recomputed in backward; none: all at once. Always exact. Memory then does not
     grow with the batch for adapter.norm group or none; with batch it grows slower, as BatchNorm needs all images."""
-    compile: bool = False
+    compile: bool = setting(False, changes="speed")
     """torch.compile the backbone's blocks; for one process and DDP, without encode_chunk. Not used in validation."""
-    engine: Literal["auto", "ddp", "fsdp2"] = "auto"
+    engine: Literal["auto", "ddp", "fsdp2"] = setting("auto", changes="speed")
     """auto: what accelerate was launched with (DDP, DeepSpeed); fsdp2 shards parameters with fully_shard."""
-    save_every: int = 200
+    save_every: int = setting(200, changes="none", at_least=1)
     """Steps between two saves of the last checkpoint; also at each epoch's end and on SIGTERM or SIGUSR1."""
-    keep: int = 2
+    keep: int = setting(2, changes="none", at_least=1)
     """Step checkpoints kept beside the best one."""
-    resume: str = "auto"
+    resume: str = setting("auto", changes="none")
     """auto continues the run folder's last checkpoint where there is one; never starts anew (and refuses to
     overwrite); or the path of a checkpoint."""
-    log_every: int = 10
+    log_every: int = setting(10, changes="none", at_least=1)
     """Steps between two progress lines and metric records."""
-    timeout: float = 600.0
+    timeout: float = setting(600.0, changes="none", above=0, at_most=MONTH)
     """Seconds a rank waits for the others in a collective before the job ends with an error."""
-    log_samples: bool = False
+    log_samples: bool = setting(False, changes="none")
     """Write the sample keys of each step to samples.rank<r>.jsonl, the proof that nothing is repeated or skipped."""
 
 
 @dataclass(frozen=True)
-class TrackingConfig:
+class TrackingConfig(Settings):
     """MLflow."""
 
-    uri: str | None = None
+    uri: str | None = setting(None, changes="none")
     """Tracking server or store; none: MLFLOW_TRACKING_URI, else sqlite in `<output>/mlflow.db`."""
-    experiment: str = "place-recognition"
+    experiment: str = setting("place-recognition", changes="none")
     """Experiment name."""
-    enabled: bool = True
+    enabled: bool = setting(True, changes="none")
     """False records nothing."""
 
 
 @dataclass(frozen=True)
-class RunConfig:
+class RunConfig(Settings):
     """A training run."""
 
-    name: str = "cricavpr"
+    name: str = setting("cricavpr", changes="none", file_name=True)
     """Name of the run and of its folder under `output`."""
-    output: str = "outputs"
+    output: str = setting("outputs", changes="none")
     """Folder of all runs."""
-    seed: int = 0
+    seed: int = setting(0, changes="numbers", at_least=0, at_most=SEEDS)
     """Seed of initialisation, plan, augmentation and dropout."""
     data: DataConfig = field(default_factory=DataConfig)
     """Training data."""
@@ -203,7 +222,10 @@ class RunConfig:
     """Loss."""
     train: TrainConfig = field(default_factory=TrainConfig)
     """Training."""
-    validate: EvaluationConfig = field(default_factory=lambda: EvaluationConfig(split="val", groups=("shuffled",)))
+    validate: EvaluationConfig = field(
+        default_factory=lambda: EvaluationConfig(split="val", groups=("shuffled",)),
+        metadata={"resume": "free"},  # no step depends on it
+    )
     """Evaluated after each epoch, best checkpoint chosen by R@5 of the first set and grouping; empty `sets`: none."""
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     """Where runs are recorded."""
@@ -230,18 +252,33 @@ def flatten(config: Any) -> dict[str, Any]:
     return flat
 
 
-def from_dict(kind: type, values: dict[str, Any], where: str = "") -> Any:
-    """Builds dataclass `kind` from plain values (a checkpoint's config.json). Unknown keys raise `UsageError`."""
-    import typing
+def from_dict(kind: type, values: Any, where: str = "", base: Any = None) -> Any:
+    """Builds dataclass `kind` from plain values, as in a checkpoint, also one written under a setting's former name.
 
-    hints = typing.get_type_hints(kind)
-    unknown = set(values) - set(hints)
-    if unknown:
-        raise UsageError(f"unknown setting '{where}{sorted(unknown)[0]}'; known here: {', '.join(hints)}")
-    built: dict[str, Any] = {}
-    for key, value in values.items():
-        if dataclasses.is_dataclass(hints[key]) and isinstance(value, dict):
-            built[key] = from_dict(typing.cast(type, hints[key]), value, f"{where}{key}.")
-        else:
-            built[key] = tuple(value) if isinstance(value, list) else value
-    return kind(**built)
+    Args:
+        kind: a config class.
+        values: a dict of its settings and, nested, its sections.
+        where: dotted prefix of the settings' names in errors, for example "validate.".
+        base: gives what `values` leave out; the defaults where it is None.
+
+    Raises:
+        UsageError: an unknown setting (with the nearest known name), or a value outside its type or range.
+    """
+    if not isinstance(values, dict):
+        raise UsageError(
+            f"{where.rstrip('.') or 'the config'} must be a section of settings; it is {shortened(values)}"
+        )
+    hints, built, base = type_hints(kind), {}, kind() if base is None else base
+    for given, value in values.items():
+        name = present_name(kind, str(given))
+        if name not in hints:
+            raise unknown(f"{where}{given}", [f"{where}{known}" for known in hints])
+        if is_section(hints[name]) and not is_section(value):
+            value = from_dict(hints[name], value, f"{where}{name}.", getattr(base, name))
+        built[name] = value
+    try:
+        config = dataclasses.replace(base, **built)
+        check(config)  # a job's own class may be a plain dataclass
+        return config
+    except SettingError as error:
+        raise error.prefix(where) from None

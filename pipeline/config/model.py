@@ -17,6 +17,7 @@ from pipeline.config.baselines import (
     SALADConfig,
     VGGConfig,
 )
+from pipeline.config.setting import Settings, setting
 
 BackboneName = Literal[
     "dinov2_vits14", "dinov2_vitb14", "dinov2_vitl14", "dinov2_vitg14",
@@ -29,34 +30,34 @@ PoolingKind = Literal["spm", "spmg", "gem", "cls", "netvlad", "cosplace", "mixvp
 
 
 @dataclass(frozen=True)
-class BackboneConfig:
+class BackboneConfig(Settings):
     """The image encoder. `name` fills the sizes; `custom` and `resnet_custom` take them from the fields below."""
 
-    name: BackboneName = "dinov2_vitb14"
+    name: BackboneName = setting("dinov2_vitb14", changes="numbers")
     """DINOv2 (paper: ViT-B/14 without registers), with registers, DINOv3, a residual network, VGG-16, or custom."""
-    weights: str | None = None
+    weights: str | None = setting(None, changes="numbers", resume="free")
     """Released weights: a .pth, a safetensors file, a transformers folder or hub name; none: random weights."""
-    dim: int = 768
+    dim: int = setting(768, changes="numbers", at_least=1, at_most=8192)
     """custom: channels D of a token."""
-    depth: int = 12
+    depth: int = setting(12, changes="numbers", at_least=1, at_most=100)
     """custom: transformer blocks."""
-    heads: int = 12
+    heads: int = setting(12, changes="numbers", at_least=1, at_most=1024)
     """custom: attention heads of a block."""
-    patch: int = 14
+    patch: int = setting(14, changes="numbers", at_least=1, at_most=1024)
     """custom: patch side in pixels."""
-    mlp_ratio: int = 4
+    mlp_ratio: int = setting(4, changes="numbers", at_least=1, at_most=16)
     """custom: hidden width of the MLP over dim."""
-    layerscale: float = 1.0
+    layerscale: float = setting(1.0, changes="numbers")
     """custom: initial LayerScale; 1.0 suits training from scratch, 1e-5 is DINOv2's own start."""
-    pretrain_grid: int = 37
+    pretrain_grid: int = setting(37, changes="numbers", at_least=1, at_most=1024)
     """custom: side of the stored position embedding's grid; it is resized once to the input's grid (DINOv2: 37)."""
-    registers: int = 0
+    registers: int = setting(0, changes="numbers", at_least=0, at_most=1024)
     """custom: register tokens (DINOv2 with registers and DINOv3: 4)."""
-    rope: bool = False
+    rope: bool = setting(False, changes="numbers")
     """custom: DINOv3's rotary positions instead of a stored position embedding."""
-    attention: Literal["sdpa", "eager", "flash_attention_2", "flex_attention"] = "sdpa"
+    attention: Literal["sdpa", "eager", "flash_attention_2", "flex_attention"] = setting("sdpa", changes="speed")
     """Attention implementation of transformers."""
-    final_norm: bool = True
+    final_norm: bool = setting(True, changes="numbers")
     """Transformers: the norm after the last block, which DINOv2's own tokens have; BoQ's release leaves it out."""
     resnet: ResNetConfig = field(default_factory=ResNetConfig)
     """Residual networks: the part used, the origin of the weights, sizes of resnet_custom."""
@@ -65,36 +66,38 @@ class BackboneConfig:
 
 
 @dataclass(frozen=True)
-class AdapterConfig:
+class AdapterConfig(Settings):
     """The adapter beside the MLP of every block (paper, section 3.3)."""
 
-    kind: Literal["mulconv", "vanilla", "conv", "conv1x1", "conv3x3", "conv5x5", "none"] = "mulconv"
+    kind: Literal["mulconv", "vanilla", "conv", "conv1x1", "conv3x3", "conv5x5", "none"] = setting(
+        "mulconv", changes="numbers"
+    )
     """mulconv (paper); vanilla bottleneck; conv: 3x3 without skip (Convpass-like); single kernels with skip; none."""
-    ratio: float = 0.5
+    ratio: float = setting(0.5, changes="numbers", above=0, at_most=16)
     """Bottleneck width over dim (paper: 0.5, so 384)."""
-    reduced: int = 24
+    reduced: int = setting(24, changes="numbers", at_least=1, at_most=8192)
     """Channels after the 1x1 reduction of the 3x3 and 5x5 paths (paper: 24)."""
-    scale: float = 0.2
+    scale: float = setting(0.2, changes="numbers")
     """The factor s of Eq. 4 (paper: 0.2)."""
-    norm: Literal["batch", "group", "none"] = "batch"
+    norm: Literal["batch", "group", "none"] = setting("batch", changes="numbers")
     """Normalisation in the convolution paths: global BatchNorm (published), GroupNorm (per image), or none."""
-    init: Literal["kaiming", "published"] = "kaiming"
+    init: Literal["kaiming", "published"] = setting("kaiming", changes="numbers")
     """Convolution initialisation: Kaiming (ours), or the published constant 1e-5, which keeps reductions one channel
     wide for ever."""
 
 
 @dataclass(frozen=True)
-class PoolingConfig:
+class PoolingConfig(Settings):
     """Patch tokens to regional features (paper, section 3.2), or one of the baselines' aggregators."""
 
-    kind: PoolingKind = "spm"
+    kind: PoolingKind = setting("spm", changes="numbers")
     """spm: pyramid, class token as its first level (paper); spmg: GeM on all levels; gem: one GeM; cls: class token;
     netvlad, cosplace, mixvpr, salad, boq: the aggregators of those methods, set below."""
-    levels: tuple[int, ...] = (1, 2, 3)
+    levels: tuple[int, ...] = setting((1, 2, 3), changes="numbers", at_least=1, at_most=64)
     """Pyramid levels n, each of n x n cells (paper: 1, 2, 3, so 14 regions)."""
-    p: float = 3.0
+    p: float = setting(3.0, changes="numbers", above=0, at_most=1000)
     """Initial exponent of GeM, learnable and shared (published: 3)."""
-    normalise: bool = True
+    normalise: bool = setting(True, changes="numbers")
     """spm, spmg, gem: L2-normalise each patch token over channels before GeM (published: yes)."""
     netvlad: NetVLADConfig = field(default_factory=NetVLADConfig)
     """NetVLAD."""
@@ -109,23 +112,23 @@ class PoolingConfig:
 
 
 @dataclass(frozen=True)
-class CrossImageConfig:
+class CrossImageConfig(Settings):
     """The cross-image encoder: attention over the images of the batch, region by region (paper, Eq. 3)."""
 
-    layers: int = 2
+    layers: int = setting(2, changes="numbers", at_least=0, at_most=100)
     """Transformer encoder layers; 0 leaves the encoder out (paper: 2)."""
-    heads: int = 16
+    heads: int = setting(16, changes="numbers", at_least=1, at_most=1024)
     """Attention heads (published: 16)."""
-    feedforward: int = 2048
+    feedforward: int = setting(2048, changes="numbers", at_least=1, at_most=65_536)
     """Width of the feed-forward part (published: 2048)."""
-    dropout: float = 0.1
+    dropout: float = setting(0.1, changes="numbers", at_least=0, below=1)
     """Dropout in attention, feed-forward and residuals (published: 0.1)."""
-    alone: bool = False
+    alone: bool = setting(False, changes="numbers")
     """Each image attends to itself only, in training too: the layers without the crossing, a control (ours)."""
 
 
 @dataclass(frozen=True)
-class ModelConfig:
+class ModelConfig(Settings):
     """The assembled model."""
 
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
@@ -136,7 +139,7 @@ class ModelConfig:
     """Regional features."""
     cross_image: CrossImageConfig = field(default_factory=CrossImageConfig)
     """The cross-image encoder."""
-    trainable: Literal["adapters", "full", "frozen", "last"] = "adapters"
+    trainable: Literal["adapters", "full", "frozen", "last"] = setting("adapters", changes="numbers", formerly="train")
     """What of the backbone is trained: its adapters (paper), all of it, nothing, or the last blocks."""
-    last_blocks: int = 4
+    last_blocks: int = setting(4, changes="numbers", at_least=1, at_most=100)
     """trainable=last: how many blocks (of a residual network: stages) at the end are trained."""

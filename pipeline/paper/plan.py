@@ -15,18 +15,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.common.errors import UsageError
-from pipeline.config import EvaluationConfig, ModelConfig, RunConfig, flatten, to_dict
+from pipeline.config import EvaluationConfig, ModelConfig, RunConfig, flatten
+from pipeline.config.setting import changing
 from pipeline.evaluation.protocol import Protocol, protocols
 from pipeline.evaluation.report import paper_numbers
 from pipeline.model.variants import VARIANTS, variant
 from pipeline.paper.rows import DEPTH, DIMENSIONS, EPOCHS, PLACES, Row
-
-# where and how fast a run happens, not what it computes
-FREE = (
-    "name", "output", "seed", "tracking.", "data.workers", "data.prefetch", "data.cache", "train.log_", "train.resume",
-    "train.save_every", "train.keep", "train.timeout", "train.engine", "train.compile", "train.encode_chunk",
-    "train.validate_first", "validate.workers", "validate.batch", "model.backbone.attention",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -61,7 +55,7 @@ class Cell:
     @property
     def key(self) -> str:
         """Ten hex digits of the set and everything its recalls depend on: the name of its results."""
-        told = {k: v for k, v in to_dict(self.config).items() if k not in ("batch", "workers", "store")}
+        told = {k: v for k, v in flatten(self.config).items() if k in changing(EvaluationConfig, "numbers")}
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:10]
 
     def protocols(self, rule: str) -> list[Protocol]:
@@ -100,7 +94,8 @@ def training(
         steps = min(steps, config.train.steps)
     # only what is not the default: a field that joins the configuration later changes no name
     default = flatten(RunConfig())
-    settings = {k: v for k, v in flatten(config).items() if not k.startswith(FREE) and v != default.get(k)}
+    computed = changing(RunConfig, "numbers") - {"seed"}  # the seed stands in the name
+    settings = {k: v for k, v in flatten(config).items() if k in computed and v != default.get(k)}
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:6]
     name = f"{_label(config, base)}-{digest}-seed{seed}"
     return Training(name, dataclasses.replace(config, name=name), steps)

@@ -25,14 +25,7 @@ from torch import Tensor
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import sync_path, usual_permissions
 from pipeline.config import RunConfig, flatten
-
-# Settings a resumed run may change: they decide where, how long and how fast, never what a step computes.
-FREE = (
-    "name", "output", "tracking.", "validate.", "data.shards", "data.workers", "data.prefetch", "data.cache",
-    "train.epochs", "train.steps", "train.patience", "train.encode_chunk", "train.compile", "train.engine",
-    "train.save_every", "train.keep", "train.resume", "train.log_every", "train.log_samples", "train.timeout",
-    "train.validate_first", "model.backbone.attention", "model.backbone.weights",
-)  # fmt: skip
+from pipeline.config.setting import on_resume, present_name
 
 
 @dataclass
@@ -179,16 +172,25 @@ def read(path: Path) -> tuple[RunState, dict[str, Any], dict[str, Tensor]]:
 def check_same(saved: dict[str, Any], config: RunConfig, state: RunState, index: str) -> None:
     """Refuses to continue a run under settings that would change what a step computes.
 
+    Args:
+        saved: the flat config of the checkpoint. A setting it lacks is younger than it and had its default's effect.
+        config: of the run that wants to continue.
+        state: of the checkpoint.
+        index: digest of the shard set's index now.
+
     Raises:
         UsageError: names the first setting that differs, with both values.
     """
-    now = flatten(config)
-    for key in sorted(set(saved) | set(now)):
-        if any(key == free or (free.endswith(".") and key.startswith(free)) for free in FREE):
+    before = flatten(RunConfig()) | {present_name(RunConfig, key): value for key, value in saved.items()}
+    now, rules = flatten(config), on_resume(RunConfig)
+    for key in sorted(set(before) | set(now)):
+        rule = rules.get(key, "refused")
+        if rule == "free" or (rule != "refused" and config.train.schedule != "cosine"):
             continue
-        if saved.get(key) != now.get(key):
+        if before.get(key) != now.get(key):
+            why = "" if rule == "refused" else ", and the rate of train.schedule cosine follows from it"
             raise UsageError(
-                f"cannot resume {config.name}: {key} was {saved.get(key)!r} and is now {now.get(key)!r}; "
+                f"cannot resume {config.name}: {key} was {before.get(key)!r} and is now {now.get(key)!r}{why}; "
                 "put it back, or choose another --name"
             )
     if state.index != index:
