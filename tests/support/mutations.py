@@ -1,56 +1,172 @@
-"""Tries inputs that were changed on purpose and counts how each ends.
+"""Seeded edits of files, and what an entry point makes of them: one line with a documented code, or something worse.
 
-The only good ends are one line with the documented code, or an acceptance that the test has found harmless.
+    outcomes = [attempt(name, lambda: read(write(changed))) for name, changed in edited_json(state, seed=0, count=60)]
+    judge("checkpoints", outcomes)
+
+`attempt` calls in this process (fast: hundreds a second); `attempt_process` runs a real `python -m`. Both give an
+`Outcome`; `judge` prints a line of counts and fails for tracebacks, hangs, other codes and errors that are not one line.
 """
 
 from __future__ import annotations
 
+import copy
+import json
+import random
 import signal
-import traceback
+import subprocess
+import sys
+import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from pipeline.common.errors import UserError
 
+ROOT = Path(__file__).resolve().parents[2]
+CODES = frozenset({2, 3})  # usage or config, data
+ODD: tuple[Any, ...] = (
+    None, True, False, -1, 0, 1, 10**9, 10**400, 0.5, -0.0, float("nan"), float("inf"), "", "x", "nul\0byte", "\n", "../../x",
+    "/etc/passwd", "x" * 5000, "\x1b[31m", "\udcff", [], [1], [[]], {}, {"a": 1}, "1", "1e400",
+)  # fmt: skip
 
-class Hang(BaseException):
-    """Not an `Exception`, so that no `except Exception` under test swallows it."""
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one edited input. `kind`: refused, accepted, traceback, hang, "code ..." or "lines"."""
+
+    name: str
+    kind: str
+    told: str = ""
 
 
-def _ring(*_: Any) -> None:
-    raise Hang
+class _Hang(BaseException):
+    """The time limit; no handler of `Exception` may swallow it."""
 
 
-class Tally:
-    """`run` tries one case; `faults` names those that ended in a traceback, a hang, or an acceptance in silence."""
+def attempt(name: str, action: Callable[[], object], codes: Collection[int] = CODES, limit: float = 20.0) -> Outcome:
+    """Calls `action`, which should raise a `UserError` of one of `codes` with one printable line, or work."""
 
-    def __init__(self, seconds: float = 20.0) -> None:
-        self.seconds, self.faults = seconds, list[str]()
-        self.ends: Counter[str] = Counter()
+    def ring(number: int, frame: FrameType | None) -> None:
+        raise _Hang
 
-    def run(self, what: str, work: Callable[[], object], codes: tuple[int, ...], harmless: bool = False) -> None:
-        """Does the work in this process. `harmless`: that it ends well is no fault."""
-        former = signal.signal(signal.SIGALRM, _ring)
-        signal.setitimer(signal.ITIMER_REAL, self.seconds)
-        try:
-            work()
-            end, fault = ("harmless", None) if harmless else ("silent acceptance", what)
-        except UserError as error:
-            line = str(error)
-            good = error.exit_code in codes and line.isprintable() and 10 < len(line) < 3000
-            end, fault = ("one line", None) if good else ("bad line", f"{what}: code {error.exit_code}, {line!r}")
-        except Hang:
-            end, fault = "hang", f"{what}: no end after {self.seconds} s"
-        except Exception:
-            end, fault = "traceback", f"{what}: {traceback.format_exc(limit=-3)}"
-        finally:
+    alarm = threading.current_thread() is threading.main_thread()
+    former = signal.signal(signal.SIGALRM, ring) if alarm else None
+    if alarm:
+        signal.setitimer(signal.ITIMER_REAL, limit)
+    try:
+        action()
+        return Outcome(name, "accepted")
+    except UserError as error:
+        return judged(name, error.exit_code, str(error), codes)
+    except _Hang:
+        return Outcome(name, "hang", f"more than {limit} s")
+    except Exception as error:
+        return Outcome(name, "traceback", f"{type(error).__name__}: {error}")
+    finally:
+        if alarm:
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, former)
-        self.ends[end] += 1
-        if fault is not None:
-            self.faults.append(f"{end}: {fault}")
 
-    def __str__(self) -> str:
-        told = ("one line", "harmless", "bad line", "traceback", "hang", "silent acceptance")
-        return f"{self.ends.total()} cases: " + ", ".join(f"{self.ends[end]} {end}" for end in told)
+
+def attempt_process(
+    name: str, arguments: Sequence[str], codes: Collection[int] = CODES, limit: float = 120.0
+) -> Outcome:
+    """`python -m ARGUMENTS` in a process of its own; accepted where it ends with 0."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", *arguments],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=limit,
+            cwd=ROOT,
+        )
+    except subprocess.TimeoutExpired:
+        return Outcome(name, "hang", f"more than {limit} s")
+    if "Traceback" in done.stderr:
+        return Outcome(name, "traceback", done.stderr[-1000:])
+    last = (done.stderr.strip() or "nothing told").split("\n")[-1]
+    return Outcome(name, "accepted") if done.returncode == 0 else judged(name, done.returncode, last, codes)
+
+
+def judged(name: str, code: int, told: str, codes: Collection[int] = CODES) -> Outcome:
+    """The outcome of a run that ended with an error of its own."""
+    if code not in codes:
+        return Outcome(name, f"code {code}", told)
+    return Outcome(name, "refused" if told and told.isprintable() else "lines", told)
+
+
+def judge(what: str, outcomes: Sequence[Outcome], harmless: Callable[[str], bool] = lambda name: False) -> None:
+    """Prints the counts and fails where anything but a refusal came, or an acceptance that is not `harmless(name)`."""
+    counts = Counter(outcome.kind for outcome in outcomes)
+    print(f"{what}: {len(outcomes)} edits: {', '.join(f'{count} {kind}' for kind, count in counts.most_common())}")
+    good = {"refused"}
+    wrong = [o for o in outcomes if o.kind not in good and not (o.kind == "accepted" and harmless(o.name))]
+    assert not wrong, "\n".join(f"{o.name}: {o.kind}: {o.told[:300]!r}" for o in wrong[:20])
+
+
+def edited_bytes(content: bytes, seed: int, count: int) -> Iterator[tuple[str, bytes]]:
+    """(what was done, changed bytes): cut, emptied, bits flipped, ranges zeroed, doubled, removed, garbage put in."""
+    draw = random.Random(seed)
+    yield "empty", b""
+    yield "one byte", content[:1]
+    yield "garbage", draw.randbytes(len(content))
+    yield "doubled", content + content
+    for number in range(max(0, count - 4)):
+        at = draw.randrange(max(1, len(content)))
+        length = draw.randint(1, max(1, len(content) // 8))
+        kind = draw.choice(["cut", "flip", "zero", "remove", "insert", "early flip", "end"])
+        if kind == "early flip":
+            at = draw.randrange(min(64, max(1, len(content))))
+        changed = {
+            "cut": lambda: content[:at],
+            "flip": lambda: content[:at] + bytes([content[at] ^ (1 << draw.randrange(8))]) + content[at + 1 :],
+            "early flip": lambda: content[:at] + bytes([content[at] ^ 0xFF]) + content[at + 1 :],
+            "zero": lambda: content[:at] + bytes(min(length, len(content) - at)) + content[at + length :],
+            "remove": lambda: content[:at] + content[at + length :],
+            "insert": lambda: content[:at] + draw.randbytes(length) + content[at:],
+            "end": lambda: content + draw.randbytes(length),
+        }[kind]()
+        if changed != content:
+            yield f"{number} {kind} at {at}", changed
+
+
+def edited_json(value: Any, seed: int, count: int) -> Iterator[tuple[str, Any]]:
+    """(what was done, changed copy): odd values at random places, keys removed, renamed and added, another top."""
+    draw = random.Random(seed)
+    for odd in (None, [], {}, 3, "text"):
+        yield f"whole = {odd!r}", odd
+    places = list(_places(value))
+    for number in range(max(0, count - 5)):
+        changed = copy.deepcopy(value)
+        path = draw.choice(places)
+        parent = changed
+        for key in path[:-1]:
+            parent = parent[key]
+        where = ".".join(map(str, path))
+        kind = draw.choice(["odd", "odd", "odd", "remove", "rename"])
+        if kind == "odd" or not isinstance(parent, dict):
+            odd = draw.choice(ODD)
+            parent[path[-1]] = copy.deepcopy(odd)
+            yield f"{number} {where} = {odd!r}"[:120], changed
+        elif kind == "remove":
+            del parent[path[-1]]
+            yield f"{number} {where} removed", changed
+        else:
+            parent[f"{path[-1]}x"] = parent.pop(path[-1])
+            yield f"{number} {where} renamed", changed
+
+
+def _places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inner in items:
+        yield (*path, key)
+        yield from _places(inner, (*path, key))
+
+
+def as_json(value: Any) -> bytes:
+    """JSON, also of values that JSON proper has not (NaN, lone surrogates)."""
+    return json.dumps(value).encode()
