@@ -4,7 +4,7 @@
     judge("checkpoints", outcomes)
 
 `attempt` calls in this process (fast: hundreds a second); `attempt_process` runs a real `python -m`. Both give an
-`Outcome`; `judge` prints a line of counts and fails for tracebacks, hangs, other codes and errors that are not one line.
+`Outcome`; `judge` prints a line of counts and fails for tracebacks, hangs, other codes and errors of several lines.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from pipeline.common.errors import UserError
 ROOT = Path(__file__).resolve().parents[2]
 CODES = frozenset({2, 3})  # usage or config, data
 ODD: tuple[Any, ...] = (
-    None, True, False, -1, 0, 1, 10**9, 10**400, 0.5, -0.0, float("nan"), float("inf"), "", "x", "nul\0byte", "\n", "../../x",
-    "/etc/passwd", "x" * 5000, "\x1b[31m", "\udcff", [], [1], [[]], {}, {"a": 1}, "1", "1e400",
+    None, True, False, -1, 0, 1, 10**9, 10**400, 0.5, -0.0, float("nan"), float("inf"), "", "x", "nul\0byte", "\n",
+    "../../x", "/etc/passwd", "x" * 5000, "\x1b[31m", "\udcff", [], [1], [[]], {}, {"a": 1}, "1", "1e400",
 )  # fmt: skip
 
 
@@ -121,17 +121,20 @@ def edited_bytes(content: bytes, seed: int, count: int) -> Iterator[tuple[str, b
         kind = draw.choice(["cut", "flip", "zero", "remove", "insert", "early flip", "end"])
         if kind == "early flip":
             at = draw.randrange(min(64, max(1, len(content))))
-        changed = {
-            "cut": lambda: content[:at],
-            "flip": lambda: content[:at] + bytes([content[at] ^ (1 << draw.randrange(8))]) + content[at + 1 :],
-            "early flip": lambda: content[:at] + bytes([content[at] ^ 0xFF]) + content[at + 1 :],
-            "zero": lambda: content[:at] + bytes(min(length, len(content) - at)) + content[at + length :],
-            "remove": lambda: content[:at] + content[at + length :],
-            "insert": lambda: content[:at] + draw.randbytes(length) + content[at:],
-            "end": lambda: content + draw.randbytes(length),
-        }[kind]()
+        changed = _edited(content, kind, at, length, draw.randbytes(length), 1 << draw.randrange(8))
         if changed != content:
             yield f"{number} {kind} at {at}", changed
+
+
+def _edited(content: bytes, kind: str, at: int, length: int, noise: bytes, bit: int) -> bytes:
+    before, after, behind = content[:at], content[at:], content[at + length :]
+    if kind == "cut":
+        return before
+    if kind in ("flip", "early flip"):
+        return before + bytes([content[at] ^ bit]) + content[at + 1 :]
+    if kind == "zero":
+        return before + bytes(min(length, len(after))) + behind
+    return {"remove": before + behind, "insert": before + noise + after, "end": content + noise}[kind]
 
 
 def edited_json(value: Any, seed: int, count: int) -> Iterator[tuple[str, Any]]:
