@@ -1,10 +1,11 @@
-"""Seeded edits of files, and what an entry point makes of them: one line with a documented code, or something worse.
+"""Changes inputs on purpose (seeded), tries them and counts how each ends.
 
-    outcomes = [attempt(name, lambda: read(write(changed))) for name, changed in edited_json(state, seed=0, count=60)]
-    judge("checkpoints", outcomes)
+The only good ends are one line with the documented code, or an acceptance that the test has found harmless.
 
-`attempt` calls in this process (fast: hundreds a second); `attempt_process` runs a real `python -m`. Both give an
-`Outcome`; `judge` prints a line of counts and fails for tracebacks, hangs, other codes and errors of several lines.
+    tally = Tally()
+    for what, changed in edited_json(told, seed=0, count=60):
+        tally.run(what, lambda: read(written(changed)), codes=(3,))
+    assert not tally.faults
 """
 
 from __future__ import annotations
@@ -15,97 +16,85 @@ import random
 import signal
 import subprocess
 import sys
-import threading
+import traceback
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from pipeline.common.errors import UserError
 
 ROOT = Path(__file__).resolve().parents[2]
-CODES = frozenset({2, 3})  # usage or config, data
 ODD: tuple[Any, ...] = (
     None, True, False, -1, 0, 1, 10**9, 10**400, 0.5, -0.0, float("nan"), float("inf"), "", "x", "nul\0byte", "\n",
     "../../x", "/etc/passwd", "x" * 5000, "\x1b[31m", "\udcff", [], [1], [[]], {}, {"a": 1}, "1", "1e400",
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of one edited input. `kind`: refused, accepted, traceback, hang, "code ..." or "lines"."""
-
-    name: str
-    kind: str
-    told: str = ""
+class Hang(BaseException):
+    """Not an `Exception`, so that no `except Exception` under test swallows it."""
 
 
-class _Hang(BaseException):
-    """The time limit; no handler of `Exception` may swallow it."""
+def _ring(*_: Any) -> None:
+    raise Hang
 
 
-def attempt(name: str, action: Callable[[], object], codes: Collection[int] = CODES, limit: float = 20.0) -> Outcome:
-    """Calls `action`, which should raise a `UserError` of one of `codes` with one printable line, or work."""
+class Tally:
+    """`run` tries one case; `faults` names those that ended in a traceback, a hang, or an acceptance in silence."""
 
-    def ring(number: int, frame: FrameType | None) -> None:
-        raise _Hang
+    def __init__(self, seconds: float = 20.0) -> None:
+        self.seconds, self.faults = seconds, list[str]()
+        self.ends: Counter[str] = Counter()
 
-    alarm = threading.current_thread() is threading.main_thread()
-    former = signal.signal(signal.SIGALRM, ring) if alarm else None
-    if alarm:
-        signal.setitimer(signal.ITIMER_REAL, limit)
-    try:
-        action()
-        return Outcome(name, "accepted")
-    except UserError as error:
-        return judged(name, error.exit_code, str(error), codes)
-    except _Hang:
-        return Outcome(name, "hang", f"more than {limit} s")
-    except Exception as error:
-        return Outcome(name, "traceback", f"{type(error).__name__}: {error}")
-    finally:
-        if alarm:
+    def run(self, what: str, work: Callable[[], object], codes: tuple[int, ...], harmless: bool = False) -> None:
+        """Does the work in this process. `harmless`: that it ends well is no fault."""
+        former = signal.signal(signal.SIGALRM, _ring)
+        signal.setitimer(signal.ITIMER_REAL, self.seconds)
+        try:
+            work()
+            end, fault = ("harmless", None) if harmless else ("silent acceptance", what)
+        except UserError as error:
+            line = str(error)
+            good = error.exit_code in codes and line.isprintable() and 10 < len(line) < 3000
+            end, fault = ("one line", None) if good else ("bad line", f"{what}: code {error.exit_code}, {line!r}")
+        except Hang:
+            end, fault = "hang", f"{what}: no end after {self.seconds} s"
+        except Exception:
+            end, fault = "traceback", f"{what}: {traceback.format_exc(limit=-3)}"
+        finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, former)
+        self.ends[end] += 1
+        if fault is not None:
+            self.faults.append(f"{end}: {fault}")
 
+    def run_process(self, what: str, arguments: Sequence[str], codes: tuple[int, ...], harmless: bool = False) -> None:
+        """The same for `python -m ARGUMENTS`, a process of its own."""
 
-def attempt_process(
-    name: str, arguments: Sequence[str], codes: Collection[int] = CODES, limit: float = 120.0
-) -> Outcome:
-    """`python -m ARGUMENTS` in a process of its own; accepted where it ends with 0."""
-    try:
-        done = subprocess.run(
-            [sys.executable, "-m", *arguments],
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=limit,
-            cwd=ROOT,
-        )
-    except subprocess.TimeoutExpired:
-        return Outcome(name, "hang", f"more than {limit} s")
-    if "Traceback" in done.stderr:
-        return Outcome(name, "traceback", done.stderr[-1000:])
-    last = (done.stderr.strip() or "nothing told").split("\n")[-1]
-    return Outcome(name, "accepted") if done.returncode == 0 else judged(name, done.returncode, last, codes)
+        def work() -> None:
+            command = [sys.executable, "-m", *arguments]
+            try:
+                done = subprocess.run(
+                    command, capture_output=True, text=True, errors="replace", timeout=self.seconds, cwd=ROOT
+                )
+            except subprocess.TimeoutExpired:
+                raise Hang from None
+            if "Traceback" in done.stderr:
+                raise RuntimeError(done.stderr[-2000:])
+            if done.returncode:
+                error = UserError((done.stderr.strip() or "nothing told").split("\n")[-1])
+                error.exit_code = done.returncode
+                raise error
 
+        former, self.seconds = self.seconds, max(self.seconds, 120.0)
+        try:
+            self.run(what, work, codes, harmless)
+        finally:
+            self.seconds = former
 
-def judged(name: str, code: int, told: str, codes: Collection[int] = CODES) -> Outcome:
-    """The outcome of a run that ended with an error of its own."""
-    if code not in codes:
-        return Outcome(name, f"code {code}", told)
-    return Outcome(name, "refused" if told and told.isprintable() else "lines", told)
-
-
-def judge(what: str, outcomes: Sequence[Outcome], harmless: Callable[[str], bool] = lambda name: False) -> None:
-    """Prints the counts and fails where anything but a refusal came, or an acceptance that is not `harmless(name)`."""
-    counts = Counter(outcome.kind for outcome in outcomes)
-    print(f"{what}: {len(outcomes)} edits: {', '.join(f'{count} {kind}' for kind, count in counts.most_common())}")
-    good = {"refused"}
-    wrong = [o for o in outcomes if o.kind not in good and not (o.kind == "accepted" and harmless(o.name))]
-    assert not wrong, "\n".join(f"{o.name}: {o.kind}: {o.told[:300]!r}" for o in wrong[:20])
+    def __str__(self) -> str:
+        told = ("one line", "harmless", "bad line", "traceback", "hang", "silent acceptance")
+        return f"{self.ends.total()} cases: " + ", ".join(f"{self.ends[end]} {end}" for end in told)
 
 
 def edited_bytes(content: bytes, seed: int, count: int) -> Iterator[tuple[str, bytes]]:
