@@ -134,7 +134,7 @@ def test_wrong_sources_are_one_clear_line(folder: Path, tmp_path: Path, monkeypa
     dinov2, run = str(folder / "dinov2.pth"), str(folder / "outputs/run")
     cases = [
         (["--source", str(tmp_path / "trap.pth")], "trap.pth: not loaded"),
-        (["--source", str(tmp_path / "text.pth")], "text.pth: not loaded, it is broken"),
+        (["--source", str(tmp_path / "text.pth")], "text.pth: neither a PyTorch nor a safetensors file"),
         (["--source", str(tmp_path / "none.pth")], "none.pth: there is no such"),
         (["--source", str(tmp_path / "cut.pth")], "cut.pth does not fit .* lacks"),
         (["--source", dinov2], "1 blocks of width 16 are none of the named backbones"),

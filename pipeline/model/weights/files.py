@@ -21,6 +21,7 @@ from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import usual_permissions
 from pipeline.config import ModelConfig, from_dict, to_dict
 from pipeline.model.vpr import PlaceModel, build_model
+from pipeline.model.weights.foreign import check_file, message
 from pipeline.model.weights.names import fit, layout, to_published
 from pipeline.model.weights.pretrained import read_tensors, unwrap
 
@@ -152,17 +153,21 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
         with safe_open(file, framework="pt") as opened:
             metadata = opened.metadata() or {}
     except (SafetensorError, OSError) as error:
+        check_file(file)  # says what it is instead
         hint = "" if file.suffix == ".safetensors" else "; jobs.weights makes one of released weights"
-        raise DataError(f"{file}: not a readable safetensors file ({error}){hint}") from error
+        raise DataError(f"{file}: not a readable safetensors file ({message(error)}){hint}") from error
     if metadata.get("format") != FORMAT:
         raise DataError(f"{file}: not a model written by this project (its metadata has no format '{FORMAT}')")
-    return {
-        "config": from_dict(ModelConfig, json.loads(metadata["config"])),
-        "image_size": int(metadata["image_size"]),
-        "everything": json.loads(metadata["everything"]),
-        "backbone_hash": metadata["backbone_hash"],
-        "extra": json.loads(metadata["extra"]),
-    }
+    try:
+        return {
+            "config": from_dict(ModelConfig, json.loads(metadata["config"])),
+            "image_size": int(metadata["image_size"]),
+            "everything": json.loads(metadata["everything"]),
+            "backbone_hash": metadata["backbone_hash"],
+            "extra": json.loads(metadata["extra"]),
+        }
+    except (KeyError, ValueError, TypeError, AttributeError) as error:
+        raise DataError(f"{file}: its metadata is damaged ({message(error)})") from error
 
 
 def checkpoint_file(path: str | Path) -> Path:

@@ -18,11 +18,16 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.common.errors import DataError, UsageError
+from pipeline.common.text import shown
+from pipeline.model.weights.foreign import check_file, check_tensors, is_safetensors, message
 from pipeline.model.weights.names import fit, published_name, to_published
 
 FILE = "model.safetensors"
 # wrappers that training codes put around a state dict
 WRAPPERS = ("model_state_dict", "state_dict", "model", "teacher")
+# what torch.compile, sharding and checkpointing add to the names of the modules they wrap, at any depth
+ADDED = ("_orig_mod.", "_fsdp_wrapped_module.", "_checkpoint_wrapped_module.", "_forward_module.")
+INSIDE = re.compile("|".join(rf"(?:(?<=\.)|^){re.escape(word)}" for word in ADDED))
 
 
 def read_tensors(source: str) -> dict[str, Tensor]:
@@ -36,16 +41,36 @@ def read_tensors(source: str) -> dict[str, Tensor]:
     if path.is_dir():
         index = path / "model.safetensors.index.json"
         if index.is_file():
-            files = sorted(set(json.loads(index.read_text())["weight_map"].values()))
-            return {name: t for file in files for name, t in _read_safetensors(path / file).items()}
+            return {name: t for file in _indexed(index) for name, t in _read_safetensors(path / file).items()}
         if not (path / FILE).is_file():
             raise UsageError(f"{source}: the folder holds no model.safetensors")
         return _read_safetensors(path / FILE)
     if path.is_file():
-        return _read_safetensors(path) if path.suffix == ".safetensors" else _read_pickle(path)
+        return _read_file(path)
     if path.suffix or source.count("/") != 1:
-        raise UsageError(f"{source}: there is no such weights file or folder")
+        raise UsageError(f"{shown(source)}: there is no such weights file or folder")
     return _read_safetensors(_from_hub(source))
+
+
+def _read_file(path: Path) -> dict[str, Tensor]:
+    """A file by what it holds, whatever its name ends in."""
+    try:
+        check_file(path)
+        return _read_safetensors(path) if is_safetensors(path) else _read_pickle(path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
+
+
+def _indexed(index: Path) -> list[str]:
+    """The files that transformers' index of a model in parts names."""
+    try:
+        files = sorted(set(json.loads(index.read_text())["weight_map"].values()))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{index}: not an index of safetensors files ({message(error)})") from error
+    for file in files:
+        if not isinstance(file, str) or Path(file).name != file or not (index.parent / file).is_file():
+            raise DataError(f"{index}: '{shown(file)}' is no file beside it")
+    return files
 
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
@@ -55,7 +80,7 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
     try:
         return load_file(path)
     except (SafetensorError, OSError) as error:
-        raise DataError(f"{path}: not a readable safetensors file ({_line(error)})") from error
+        raise DataError(f"{path}: not a readable safetensors file ({message(error)})") from error
 
 
 def _read_pickle(path: Path) -> dict[str, Tensor]:
@@ -66,16 +91,21 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
         for module in ("numpy.core.multiarray", "numpy._core.multiarray"):
             numpy_data.append((function, f"{module}.{function.__name__}"))
     try:
-        with torch.serialization.safe_globals(numpy_data):
-            loaded = torch.load(path, map_location="cpu", weights_only=True)
+        with (
+            torch.serialization.safe_globals(numpy_data),
+            path.open("rb") as stream,
+        ):  # a path's ending would mislead it
+            loaded = torch.load(stream, map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load has no closed list: zip, pickle, end of file, unsafe globals
         raise DataError(
             f"{path}: not loaded, it is broken or holds more than tensors, and foreign code is never run "
-            f"({_line(error)})"
+            f"({message(error)})"
         ) from error
     if not isinstance(loaded, Mapping):
         raise DataError(f"{path}: holds a {type(loaded).__name__}, not a state dict")
-    return unwrap(loaded, str(path))
+    tensors = unwrap(loaded, str(path))
+    check_tensors(tensors, path)
+    return tensors
 
 
 def unwrap(state: Mapping[str, Any], source: str) -> dict[str, Tensor]:
@@ -88,13 +118,15 @@ def unwrap(state: Mapping[str, Any], source: str) -> dict[str, Tensor]:
         if isinstance(state.get(key), Mapping):
             state = state[key]
             break
-    tensors = {name: t for name, t in state.items() if isinstance(t, Tensor)}
+    tensors = {name: t for name, t in state.items() if isinstance(t, Tensor) and isinstance(name, str)}
     if not tensors:
         raise DataError(f"{source}: holds no tensors")
-    for prefix in ("module.", "_orig_mod."):
-        if all(name.startswith(prefix) for name in tensors):
-            tensors = {name.removeprefix(prefix): t for name, t in tensors.items()}
-    return tensors
+    bare = {INSIDE.sub("", name): t for name, t in tensors.items()}
+    while all(name.startswith("module.") for name in bare):
+        bare = {name.removeprefix("module."): t for name, t in bare.items()}
+    if len(bare) < len(tensors):
+        raise DataError(f"{source}: two tensors have the same name once {', '.join(ADDED)} are taken out")
+    return bare
 
 
 def _from_hub(name: str) -> Path:
@@ -108,14 +140,9 @@ def _from_hub(name: str) -> Path:
             return Path(hf_hub_download(name, FILE))
         except Exception as error:  # the client's own errors and those of every network library under it
             raise UsageError(
-                f"{name}: no such file or folder here, and the model hub did not give it ({_line(error)}); "
+                f"{name}: no such file or folder here, and the model hub did not give it ({message(error)}); "
                 "download the weights and give their path"
             ) from missing
-
-
-def _line(error: Exception) -> str:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) < 160 else text[:157] + "..."
 
 
 def backbone_tensors(tensors: Mapping[str, Tensor], source: str, registers: bool = False) -> dict[str, Tensor]:
