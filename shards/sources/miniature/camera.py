@@ -1,12 +1,13 @@
-"""The camera of a drawn street, and flat surfaces seen through it in true perspective.
+"""The camera of a drawn street, and upright walls seen through it in true perspective.
 
 World axes of a place, in metres: x to the right along the street, y up, z away from the camera.
-Invariant: a surface is one plane, so its picture is one homography; nothing behind the camera is ever drawn.
+Invariant: a wall is one plane, so its picture is one homography; nothing behind the camera is ever drawn.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,16 +16,17 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 Array = NDArray[np.float64]
+Point = tuple[float, float, float]
+Pixels = list[tuple[float, float]]
 NEAR = 0.4  # metres
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole with a shifted lens (verticals stay vertical) and a little roll.
+    """A pinhole with a shifted lens, so that verticals stay vertical.
 
     Args:
-        x, y, z: position in metres.
-        yaw: heading from +z towards +x, in radians; roll: in radians.
+        x, y, z: position in metres; yaw: heading from +z towards +x, in radians.
         focal: in pixels; horizon: its row in pixels; width, height: of the canvas in pixels.
     """
 
@@ -34,29 +36,30 @@ class Camera:
     yaw: float
     focal: float
     horizon: float
-    roll: float
     width: int
     height: int
 
     @cached_property
-    def place(self) -> Array:
-        return np.array([self.x, self.y, self.z])
-
-    @cached_property
     def matrix(self) -> Array:
         """[3, 3] world directions to homogeneous pixels."""
-        c, s = math.cos(self.yaw), math.sin(self.yaw)
-        turn = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
-        lens = np.array(
-            [[self.focal, 0.0, self.width / 2], [0.0, -self.focal, self.horizon], [0.0, 0.0, 1.0]], dtype=np.float64
-        )
-        a, b, u, v = math.cos(self.roll), math.sin(self.roll), self.width / 2, self.height / 2
-        tilt = np.array([[a, -b, u - a * u + b * v], [b, a, v - b * u - a * v], [0.0, 0.0, 1.0]])
-        return np.asarray(tilt @ lens @ turn)
+        c, s, f, u, v = math.cos(self.yaw), math.sin(self.yaw), self.focal, self.width / 2, self.horizon
+        return np.array([[f * c + u * s, 0.0, u * c - f * s], [v * s, -f, v * c], [s, 0.0, c]])
 
-    def polygon(self, points: Array) -> list[tuple[float, float]]:
-        """Pixels of a convex polygon [n, 3], cut at the near plane; under 3 points when it is out of sight."""
-        rows = ((points - self.place) @ self.matrix.T).tolist()
+    def project(self, points: Sequence[Point]) -> Array:
+        """[n, 3] homogeneous pixels; the last column is the depth in metres."""
+        return np.asarray((np.array(points) - (self.x, self.y, self.z)) @ self.matrix.T)
+
+    def sees(self, x0: float, z0: float, x1: float, z1: float) -> bool:
+        """Whether something between these corners on the ground may be in the picture."""
+        feet = self.project([(x, 0.0, z) for x in (x0, x1) for z in (z0, z1)])
+        if feet[:, 2].min() < NEAR:
+            return bool(feet[:, 2].max() > NEAR)
+        columns = feet[:, 0] / feet[:, 2]
+        return bool(columns.max() > -8 and columns.min() < self.width + 8)
+
+    def polygon(self, points: Sequence[Point]) -> Pixels:
+        """Pixels of a convex polygon, cut at the near plane; empty when it is out of sight."""
+        rows = self.project(points).tolist()
         kept: list[tuple[float, float, float]] = []
         for (x0, y0, w0), (x1, y1, w1) in zip(rows, rows[1:] + rows[:1], strict=True):
             if w0 >= NEAR:
@@ -65,75 +68,62 @@ class Camera:
                 t = (NEAR - w0) / (w1 - w0)
                 kept.append((x0 + t * (x1 - x0), y0 + t * (y1 - y0), NEAR))
         pixels = [(x / w, y / w) for x, y, w in kept]
-        us, vs = [p[0] for p in pixels], [p[1] for p in pixels]
-        if len(pixels) < 3 or max(us) <= 0 or min(us) >= self.width or max(vs) <= 0 or min(vs) >= self.height:
+        if len(pixels) < 3:
             return []
-        return pixels
-
-    def depth(self, x: float, z: float) -> float:
-        """Metres along the optical axis."""
-        return math.sin(self.yaw) * (x - self.x) + math.cos(self.yaw) * (z - self.z)
+        us, vs = [u for u, _ in pixels], [v for _, v in pixels]
+        return pixels if max(us) > 0 and min(us) < self.width and max(vs) > 0 and min(vs) < self.height else []
 
 
-@dataclass(frozen=True)
-class Surface:
-    """A rectangle in the world: its top left corner, and its edges to the right and down, in metres."""
-
-    corner: tuple[float, float, float]
-    right: tuple[float, float, float]
-    down: tuple[float, float, float]
-
-    @cached_property
-    def corners(self) -> Array:
-        """[4, 3], clockwise from the top left as its front is seen."""
-        o, r, d = np.array(self.corner), np.array(self.right), np.array(self.down)
-        return np.stack([o, o + r, o + r + d, o + d])
-
-    @cached_property
-    def normal(self) -> Array:
-        """Unit vector towards the side from which it is seen."""
-        (a, b, c), (d, e, f) = self.right, self.down
-        n = np.array([b * f - c * e, c * d - a * f, a * e - b * d])
-        return np.asarray(n / math.sqrt(float(n @ n)))
-
-    def faces(self, camera: Camera) -> bool:
-        x, y, z = self.normal.tolist()
-        u, v, w = self.corner
-        return bool(x * (camera.x - u) + y * (camera.y - v) + z * (camera.z - w) > 0.01)
+def normal(points: Sequence[Point]) -> Array:
+    """[3] unit vector towards the side from which a polygon's points run clockwise."""
+    (a, b, c), (d, e, f) = points[0], points[len(points) // 2]
+    (i, j, k), (p, q, o) = points[1], points[-1]
+    (u, v, w), (r, s, t) = (d - a, e - b, f - c), (p - i, q - j, o - k)
+    n = np.array([v * t - w * s, w * r - u * t, u * s - v * r])
+    return np.asarray(n / math.sqrt(float(n @ n)))
 
 
-def lay(canvas: Image.Image, camera: Camera, surface: Surface, picture: Image.Image, alpha: Image.Image | None) -> None:
-    """Draws `picture` (RGB), cut out by `alpha` (L, same size) where given, on the surface as the camera sees it."""
-    outline = camera.polygon(surface.corners)
+def faces(points: Sequence[Point], camera: Camera) -> bool:
+    """Whether the camera stands before a polygon, not behind it."""
+    x, y, z = points[0]
+    return float(normal(points) @ (camera.x - x, camera.y - y, camera.z - z)) > 0.01
+
+
+def upright(x0: float, z0: float, x1: float, z1: float, low: float, high: float) -> list[Point]:
+    """A wall from the foot (x0, z0) on its left to (x1, z1) on its right, clockwise from the top left."""
+    return [(x0, high, z0), (x1, high, z1), (x1, low, z1), (x0, low, z0)]
+
+
+def lay(
+    canvas: Image.Image, camera: Camera, wall: list[Point], picture: Image.Image, alpha: Image.Image | None
+) -> None:
+    """Draws `picture` (RGB), cut out by `alpha` (L, same size) where given, on a rectangle as the camera sees it."""
+    outline = camera.polygon(wall)
     if not outline:
         return
-    us, vs = [p[0] for p in outline], [p[1] for p in outline]
+    us, vs = [u for u, _ in outline], [v for _, v in outline]
     left, top = max(math.floor(min(us)), 0), max(math.floor(min(vs)), 0)
     wide, high = min(math.ceil(max(us)), camera.width) - left, min(math.ceil(max(vs)), camera.height) - top
     if wide < 1 or high < 1:
         return
-    width, height = picture.size
-    right, down = np.array(surface.right) / (width - 2), np.array(surface.down) / (height - 2)
-    start = np.array(surface.corner) - right - down  # one pixel of margin keeps the border's colour at the edges
-    forward = camera.matrix @ np.stack([right, down, start - camera.place], axis=1)
-    forward = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]]) @ forward
-    back = np.linalg.inv(forward)
-    # texture pixels for a canvas pixel in the middle of the outline: shrink first what would alias
-    u, v = sum(us) / len(us) - left, sum(vs) / len(vs) - top
-    s, t, w = back @ np.array([u, v, 1.0])
-    shrink_x = min(max(int(abs(back[0, 0] - s / w * back[2, 0]) / abs(w) + 0.25), 1), max(width // 4, 1))
-    shrink_y = min(max(int(abs(back[1, 1] - t / w * back[2, 1]) / abs(w) + 0.25), 1), max(height // 4, 1))
-    if shrink_x > 1 or shrink_y > 1:
+    shrink_x, shrink_y = (
+        min(max(int(size / (max(at) - min(at))), 1), max(size // 4, 1))
+        for size, at in zip(picture.size, (us, vs), strict=True)
+    )
+    if max(shrink_x, shrink_y) > 1:  # what would alias
         picture = picture.reduce((shrink_x, shrink_y))
-        alpha = alpha.reduce((shrink_x, shrink_y)) if alpha is not None else None
-        back = np.diag([1 / shrink_x, 1 / shrink_y, 1.0]) @ back
-    scale = back[2, 2] if abs(back[2, 2]) > 1e-12 else 1e-12
-    data = tuple((back / scale).ravel()[:8].tolist())
+        alpha = alpha.reduce((shrink_x, shrink_y)) if alpha else None
+    (a, b, _, d), (width, height) = np.array(wall), picture.size
+    right, down = (b - a) / (width - 2), (d - a) / (height - 2)
+    start = a - right - down - (camera.x, camera.y, camera.z)  # one pixel of margin keeps the border's colour
+    forward = camera.matrix @ np.stack([right, down, start], axis=1)
+    back = np.linalg.inv(np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]]) @ forward)
+    data = tuple((back / (back[2, 2] if abs(back[2, 2]) > 1e-12 else 1e-12)).ravel()[:8].tolist())
     kind, smooth = Image.Transform.PERSPECTIVE, Image.Resampling.BILINEAR
     patch = picture.transform((wide, high), kind, data, smooth)
     if alpha is not None:
         mask = alpha.transform((wide, high), kind, data, smooth)
     else:
         mask = Image.new("L", (wide, high), 0)
-        ImageDraw.Draw(mask).polygon([(x - left, y - top) for x, y in outline], fill=255)
+        ImageDraw.Draw(mask).polygon([(u - left, v - top) for u, v in outline], fill=255)
     canvas.paste(patch, (left, top), mask)

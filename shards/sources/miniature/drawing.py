@@ -10,157 +10,139 @@ import json
 import multiprocessing
 import os
 import time
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.progress import Progress
-from shards.sources.miniature.layout import PlacePhotos, data_frames, plan_photos
+from shards.sources.miniature.photograph import Studio
+from shards.sources.miniature.plan import PlacePhotos, data_frames, plan_photos
 
-FORMAT = 1  # of the pictures: raise it when a change of the drawing changes their bytes
+FORMAT = 2  # of the pictures: raise it when a change of the drawing changes their bytes
+
+
+@dataclass(frozen=True)
+class MiniatureConfig:
+    """What to draw, and where."""
+
+    out: str = "data/miniature"
+    """Folder that gets gsv/ (GSV-Cities' layout) and eval/miniature/ (database and queries)."""
+    places: int = 300
+    """Training places, spread evenly over four towns."""
+    street_places: int = 1
+    """Places along one street, 10 to 20 m apart, that show some of the same houses (1 to 20); 1: a street each."""
+    seed: int = 0
+    """Seed of everything; the same seed gives the same bytes."""
+    width: int = 320
+    """Width of a photo in pixels (32 to 2048)."""
+    height: int = 240
+    """Height of a photo in pixels (32 to 2048)."""
+    val_places: int | None = None
+    """Places of the validation folder; none: a fifth of --places."""
+    test_places: int | None = None
+    """Places of the test folder; none: a third of --places."""
+    workers: int | None = None
+    """Processes; none: one a core. The files are the same with any number."""
+
+    def counts(self) -> tuple[int, int, int]:
+        """Training, validation and test places.
+
+        Raises:
+            UsageError: a count or size that cannot be.
+        """
+        val, test = (
+            max(self.places // share, 2) if n is None else n
+            for n, share in ((self.val_places, 5), (self.test_places, 3))
+        )
+        streets = -(-max(self.places, val, test) // max(self.street_places, 1))
+        for name, value, low, high in (
+            ("places", self.places, 1, None), ("val_places", val, 0, None), ("test_places", test, 0, None),
+            ("street_places", self.street_places, 1, 20), ("width", self.width, 32, 2048),
+            ("height", self.height, 32, 2048), ("workers", 1 if self.workers is None else self.workers, 1, None),
+            ("streets of one split (places / street_places)", streets, 1, 1100),
+        ):  # fmt: skip
+            if value < low or (high is not None and value > high):
+                raise UsageError(f"{name} = {value}: must be {low} " + (f"to {high}" if high else "or more"))
+        return self.places, val, test
 
 
 @dataclass(frozen=True)
 class MiniatureSummary:
-    """What was asked for and what was drawn now.
+    """What was asked for (photos by folder: "gsv", "val/database", ...) and how many were drawn now, in how long."""
 
-    Args:
-        training: folder in GSV-Cities' layout; evaluation: folder holding `images/{val,test}/{database,queries}`.
-        places, images: of the training set; database, queries: photos of each evaluation split.
-        drawn: photos drawn by this call; the others were there. seconds: wall time.
-    """
-
-    training: Path
-    evaluation: Path
-    places: int
-    images: int
-    database: dict[str, int]
-    queries: dict[str, int]
+    photos: dict[str, int]
     drawn: int
     seconds: float
 
     def describe(self) -> str:
         """One line for a person."""
-        sets = ", ".join(f"{s} {self.database[s]} database + {self.queries[s]} queries" for s in self.database)
         done = f"{self.drawn} drawn in {self.seconds:.1f} s" if self.drawn else "nothing to do"
-        return f"{self.places} places with {self.images} photos in {self.training}; {sets} in {self.evaluation}; {done}"
+        return ", ".join(f"{n} photos in {name}" for name, n in self.photos.items()) + "; " + done
 
 
-def draw(
-    out: Path,
-    places: int = 300,
-    seed: int = 0,
-    size: tuple[int, int] = (320, 240),
-    workers: int | None = None,
-    val_places: int | None = None,
-    test_places: int | None = None,
-) -> MiniatureSummary:
+def draw(config: MiniatureConfig) -> MiniatureSummary:
     """Draws what is missing of the miniature with these settings.
-
-    Args:
-        out: folder that gets `gsv/` and `eval/miniature/`.
-        places: training places, spread evenly over the towns.
-        seed: of everything.
-        size: width and height of a photo in pixels.
-        workers: processes; None: one a core. The files are the same with any number.
-        val_places, test_places: evaluation places; None: a fifth and a third of `places`.
 
     Raises:
         UsageError: a count or size that cannot be.
-        DataError: `out` holds a miniature of other settings, or cannot be written.
+        DataError: the folder holds a miniature of other settings, or cannot be written.
     """
-    started = time.monotonic()
-    val_places = max(places // 5, 2) if val_places is None else val_places
-    test_places = max(places // 3, 2) if test_places is None else test_places
-    _check(places, val_places, test_places, size, workers)
-    out = Path(out)
-    settings = {
-        "format": FORMAT, "places": places, "seed": seed, "size": list(size),
-        "val_places": val_places, "test_places": test_places,
-    }  # fmt: skip
+    started, out, counts = time.monotonic(), Path(config.out), config.counts()
     try:
-        _claim(out, settings)
-        planned = plan_photos(places, seed, val_places, test_places)
-        for folder in {(out / photo.file).parent for place in planned for photo in place.photos}:
+        _claim(out, config, counts)
+        planned = plan_photos(config.seed, counts, config.street_places)
+        files = [photo.file for place in planned for photo in place.photos]
+        for folder in {(out / file).parent for file in files}:
             folder.mkdir(parents=True, exist_ok=True)
-        missing = _missing(out, planned)
+        there = {path.relative_to(out).as_posix() for top in ("gsv", "eval") for path in (out / top).rglob("*.*")}
+        left = (replace(place, photos=tuple(p for p in place.photos if p.file not in there)) for place in planned)
+        missing = [place for place in left if place.photos]
         drawn = sum(len(place.photos) for place in missing)
-        _draw_all(out, missing, size, min(workers or _cores(), max(len(missing), 1)))
+        with Progress("drawing the miniature", drawn, "photos") as progress:
+            for done in _run(out, missing, config):
+                progress.advance(done)
         for path, text in data_frames(planned).items():  # last: a reader that finds them finds every photo
             if not (out / path).is_file() or (out / path).read_text() != text:
                 (out / path).parent.mkdir(parents=True, exist_ok=True)
                 write_whole(out / path, text.encode())
     except OSError as error:
         raise DataError(f"{error.filename or out}: the miniature cannot be written there ({error.strerror})") from error
-    count = lambda part: sum(part in p.file for place in planned for p in place.photos)  # noqa: E731
-    splits = ("val", "test")
-    return MiniatureSummary(
-        out / "gsv", out / "eval" / "miniature", places, count("gsv/"),
-        {s: count(f"/{s}/database/") for s in splits}, {s: count(f"/{s}/queries/") for s in splits},
-        drawn, time.monotonic() - started,
-    )  # fmt: skip
+    photos = Counter("gsv" if file.startswith("gsv") else "/".join(file.split("/")[-3:-1]) for file in files)
+    return MiniatureSummary(dict(photos), drawn, time.monotonic() - started)
 
 
-def _check(places: int, val_places: int, test_places: int, size: tuple[int, int], workers: int | None) -> None:
-    if places < 1 or val_places < 0 or test_places < 0:
-        raise UsageError(f"places={places}, val_places={val_places}, test_places={test_places}: at least 1, 0 and 0")
-    if max(places, val_places, test_places) > 1100:
-        raise UsageError(
-            f"places={max(places, val_places, test_places)}: the miniature's map has room for 1100 places a split"
-        )
-    if min(size) < 32 or max(size) > 2048:
-        raise UsageError(f"size={size}: a photo's sides must lie between 32 and 2048 pixels")
-    if workers is not None and workers < 1:
-        raise UsageError(f"workers={workers}: at least one process")
-
-
-def _claim(out: Path, settings: dict[str, object]) -> None:
+def _claim(out: Path, config: MiniatureConfig, counts: tuple[int, int, int]) -> None:
     """Writes the settings beside the photos, or refuses a folder drawn with others."""
+    settings = {"format": FORMAT, **dict(zip(("places", "val_places", "test_places"), counts, strict=True))}
+    settings |= {name: getattr(config, name) for name in ("street_places", "seed", "width", "height")}
     note = out / "miniature.json"
-    if note.is_file():
-        try:
-            found = json.loads(note.read_text())
-        except ValueError as error:
-            raise DataError(f"{note}: not readable ({error}); remove {out} and draw again") from error
-        if found != settings:
-            other = ", ".join(f"{k} {found.get(k)} there, {v} asked" for k, v in settings.items() if found.get(k) != v)
-            raise DataError(f"{out} holds a miniature of other settings ({other}); give another --out or remove it")
+    if not note.is_file():
+        out.mkdir(parents=True, exist_ok=True)
+        write_whole(note, (json.dumps(settings, indent=1) + "\n").encode())
         return
-    out.mkdir(parents=True, exist_ok=True)
-    write_whole(note, (json.dumps(settings, indent=1) + "\n").encode())
+    try:
+        found = json.loads(note.read_text())
+        other = ", ".join(f"{k} {found.get(k)} there, {v} asked" for k, v in settings.items() if found.get(k) != v)
+    except (ValueError, AttributeError) as error:
+        raise DataError(f"{note}: not readable ({error}); remove {out} and draw again") from error
+    if other:
+        raise DataError(f"{out} holds a miniature of other settings ({other}); give another --out or remove it")
 
 
-def _missing(out: Path, planned: list[PlacePhotos]) -> list[PlacePhotos]:
-    """The places with the photos that are not there yet."""
-    there = {
-        path.as_posix() for top in ("gsv", "eval") for path in (out / top).rglob("*") if path.suffix.lower() == ".jpg"
-    }
-    left = []
-    for place in planned:
-        photos = tuple(p for p in place.photos if (out / p.file).as_posix() not in there)
-        if photos:
-            left.append(PlacePhotos(place.town, place.seed, photos))
-    return left
-
-
-def _draw_all(out: Path, missing: list[PlacePhotos], size: tuple[int, int], workers: int) -> None:
-    if not missing:
-        return
-    with Progress("drawing the miniature", sum(len(p.photos) for p in missing), "photos") as progress:
-        for done in _run(out, missing, size, workers):
-            progress.advance(done)
-
-
-def _run(out: Path, missing: list[PlacePhotos], size: tuple[int, int], workers: int) -> Iterator[int]:
-    if workers == 1:
-        for place in missing:
-            yield draw_place(out, place, size)
+def _run(out: Path, missing: list[PlacePhotos], config: MiniatureConfig) -> Iterator[int]:
+    """Draws the places, and yields how many photos are done each time some are."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    parts, size = [missing[k : k + 8] for k in range(0, len(missing), 8)], (config.width, config.height)
+    workers = min(config.workers or cores, len(parts))
+    if workers < 2:
+        yield from (_draw_some(out, part, size) for part in parts)
         return
     # spawn: the caller may hold threads (torch, OpenMP) that a fork would break
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(_draw_some, out, missing[k : k + 8], size) for k in range(0, len(missing), 8)]
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        futures = [pool.submit(_draw_some, out, part, size) for part in parts]
         try:
             for future in as_completed(futures):
                 yield future.result()
@@ -169,17 +151,14 @@ def _run(out: Path, missing: list[PlacePhotos], size: tuple[int, int], workers: 
 
 
 def _draw_some(out: Path, places: list[PlacePhotos], size: tuple[int, int]) -> int:
-    return sum(draw_place(out, place, size) for place in places)
-
-
-def draw_place(out: Path, place: PlacePhotos, size: tuple[int, int]) -> int:
-    """Draws and writes the photos of one place; returns how many."""
-    from shards.sources.miniature.picture import Studio
-
-    studio = Studio(place.town, place.seed)
-    for photo in place.photos:
-        write_whole(out / photo.file, studio.photograph(photo, size))
-    return len(place.photos)
+    """Draws and writes the photos of these places; neighbours on a street share its facades."""
+    street, studio = None, None
+    for place in places:
+        if studio is None or place.seed != street:
+            street, studio = place.seed, Studio(place.town, place.seed, place.length)
+        for photo in place.photos:
+            write_whole(out / photo.file, studio.photograph(photo, size))
+    return sum(len(place.photos) for place in places)
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -187,7 +166,3 @@ def write_whole(path: Path, content: bytes) -> None:
     temporary = path.with_name(f".{os.getpid()}.{path.name[-40:]}.part")
     temporary.write_bytes(content)
     temporary.replace(path)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

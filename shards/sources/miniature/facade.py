@@ -1,183 +1,242 @@
-"""Facades: flat pictures of walls with windows, doors, shops and signs, later laid on the walls in perspective.
+"""Facades: flat pictures of walls with windows, doors, shops and signs, later laid on the houses in perspective.
 
-Invariant: a facade depends on its building and face alone.
+Invariant: a wall depends on its building and face alone; its panes and ledges tell the photo what may shine at night
+and where snow lies.
 """
 
 from __future__ import annotations
 
-import itertools
+from functools import lru_cache
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageChops, ImageDraw, ImageFont
 
-from shards.sources.miniature.landmark import church, mural, tower
-from shards.sources.miniature.painter import PX, Painter, Wall, pattern, tone, window
 from shards.sources.miniature.place import Building
-from shards.sources.miniature.styles import RGB, SIGN_COLOURS, SIGNS
+from shards.sources.miniature.towns import RGB, SIGN_COLOURS, SIGNS, tone
+
+PX = 15  # pixels a metre
+MANSARD = 2.7  # metres of a storey under a steep roof
+GLASS, INK, PAPER = (84, 100, 116), (46, 42, 42), (238, 232, 220)
+Box = tuple[float, float, float, float]
 
 
-def front(building: Building) -> Wall:
-    """The street face of a house, with its gable."""
-    rng = np.random.default_rng([building.seed, 7])
-    family = building.family
-    depth_axis = building.fronts[0] in ("east", "west")
-    width = building.z1 - building.z0 if depth_axis else building.x1 - building.x0
-    if building.landmark == "church":
-        return church(building, width, rng)
-    extra = {"gable": width * 0.5, "stepped": width * 0.5 + 0.6}.get(family.roof, 0.0)
-    colour = tone(family.walls[int(rng.integers(len(family.walls)))], float(rng.uniform(0.93, 1.07)))
-    p = Painter(width, building.height + extra, colour)
-    pattern(p, family, colour, rng)
-    if building.landmark == "tower":
-        tower(p, building, rng)
-        return p.wall
-    shop = rng.random() < family.shops and width > 4.5
-    _floors(p, building, rng, shop)
-    _ground(p, building, rng, shop, colour)
-    if extra:
-        _gable(p, building, extra, rng)
-    else:
-        top = building.height
-        p.rect(0, top - 0.35, width, top, tone(family.trim, 0.92))
-        p.rect(0, top - 0.5, width, top - 0.35, tone(family.trim, 0.6))
-        p.wall.ledges.append((0, width * PX, (p.height - top) * PX))
-    return p.wall
+class Wall:
+    """A wall's picture (RGB), `width` x `height` metres, drawn in metres from its lower left corner.
+
+    `panes` are windows and how likely each is lit after dark; `ledges` (x0, x1, y) carry snow; `alpha` (L) cuts a
+    gable out, None is a full rectangle.
+    """
+
+    def __init__(self, b: Building, width: float, rise: float, face: int) -> None:
+        self.width, self.height, self.family = width, b.height + rise, b.family
+        self.rng = np.random.default_rng([b.seed, face])
+        self.size = (max(int(width * PX), 8), max(int(self.height * PX), 8))
+        self.colour = tone(b.family.walls[b.seed % len(b.family.walls)], 0.93 + 0.14 * (b.seed % 97) / 97)
+        x, y = (int(self.rng.integers(0, max(512 - side, 1))) for side in self.size)
+        tile = masonry(b.family.pattern).crop((x, y, x + self.size[0], y + self.size[1]))
+        self.picture = ImageChops.multiply(Image.new("RGB", self.size, self.colour), tile)
+        self.draw = ImageDraw.Draw(self.picture)
+        self.alpha: Image.Image | None = None
+        self.panes: list[tuple[Box, float]] = []
+        self.ledges: list[tuple[float, float, float]] = []
+
+    def box(self, x0: float, y0: float, x1: float, y1: float) -> Box:
+        """Left, top, right, bottom in pixels."""
+        return x0 * PX, (self.height - y1) * PX, x1 * PX, (self.height - y0) * PX
+
+    def rect(self, x0: float, y0: float, x1: float, y1: float, colour: RGB) -> None:
+        a, b, c, d = self.box(x0, y0, x1, y1)
+        if c > a and d > b:
+            self.draw.rectangle((a, b, max(c - 1, a), max(d - 1, b)), fill=colour)
+
+    def disc(self, x: float, y: float, r: float, colour: RGB) -> None:
+        self.draw.ellipse(self.box(x - r, y - r, x + r, y + r), fill=colour)
+
+    def pane(self, x0: float, y0: float, x1: float, y1: float, colour: RGB, lit: float = 0.36) -> None:
+        """A window's glass, lit after dark with this chance."""
+        self.rect(x0, y0, x1, y1, colour)
+        self.panes.append((self.box(x0, y0, x1, y1), lit))
+
+    def window(self, x: float, y: float, w: float, h: float) -> None:
+        """One window with its lower left corner at (x, y)."""
+        f, rng = self.family, self.rng
+        glass, curtain = tone(GLASS, float(rng.uniform(0.6, 1.15))), rng.random()
+        self.rect(x - 0.14, y - 0.2, x + w + 0.14, y + h + 0.14, tone(f.trim, 0.95))
+        self.pane(x, y, x + w, y + h, glass)
+        self.rect(x, y + h * 0.55, x + w, y + h, tone(glass, 0.78))
+        if curtain < 0.4:
+            self.rect(x, y + h * 0.4, x + w * (1 if curtain < 0.25 else 0.3), y + h, (206, 200, 188))
+        self.ledges.append((x - 0.2, x + w + 0.2, y - 0.1))
+        self.rect(x + w / 2 - 0.05, y, x + w / 2 + 0.05, y + h, f.trim)
+        if f.window == "sash":
+            self.rect(x, y + h / 2 - 0.05, x + w, y + h / 2 + 0.05, f.trim)
+        elif f.window == "arch":
+            for r, colour in ((w / 2 + 0.14, tone(f.trim, 0.9)), (w / 2 - 0.06, tone(glass, 0.75))):
+                self.draw.pieslice(self.box(x + w / 2 - r, y + h - r, x + w / 2 + r, y + h + r), 180, 360, fill=colour)
+        elif f.window == "shutter":
+            for s in (x - 0.14 - w * 0.48, x + w + 0.14):
+                self.rect(s, y - 0.05, s + w * 0.48, y + h + 0.05, f.accent)
+                self.rect(s + 0.1, y + 0.1, s + w * 0.48 - 0.1, y + h - 0.1, tone(f.accent, 0.8))
+
+    def cut(self, edge: list[tuple[float, float]]) -> None:
+        """Takes away what lies above a line from the left to the right edge, and draws its coping."""
+        line = [(x * PX, (self.height - y) * PX) for x, y in edge]
+        self.alpha = Image.new("L", self.size, 255)
+        ImageDraw.Draw(self.alpha).polygon([(0, 0), *line, (self.size[0], 0)], fill=0)
+        self.draw.line(line, fill=tone(self.family.trim, 0.95), width=5)
 
 
-def side(building: Building, width: float) -> Wall:
-    """A plain side or back wall: few windows, sometimes a mural."""
-    rng = np.random.default_rng([building.seed, 11])
-    family = building.family
-    chosen = np.random.default_rng([building.seed, 7])
-    colour = tone(family.walls[int(chosen.integers(len(family.walls)))], float(chosen.uniform(0.93, 1.07)))
-    p = Painter(width, building.height, colour)
-    pattern(p, family, colour, rng)
-    if building.mural:
-        mural(p, 0.6, 0.8, width - 0.6, min(building.height - 1.0, 9.0), rng)
-    else:
-        for floor in range(building.floors):
-            for x in np.arange(1.6, width - 1.6, family.bay * 2):
-                if rng.random() < 0.35:
-                    window(p, family, float(x), floor * family.storey + 1.2, 0.9, 1.4, rng)
-    return p.wall
+@lru_cache(maxsize=8)
+def masonry(kind: str) -> Image.Image:
+    """A 512 x 512 RGB relief of courses and stains, to multiply a wall's colour with."""
+    rng, relief = np.random.default_rng([3, *map(ord, kind)]), np.full((512, 512), 238.0)
+    for cells, weight in ((8, 9.0), (32, 7.0), (512, 6.0)):
+        coarse = Image.fromarray(rng.normal(0, weight, (cells, cells)).astype(np.float32))
+        relief += np.asarray(coarse.resize((512, 512), Image.Resampling.BICUBIC))
+    course = {"brick": 3, "stone": 8, "timber": 4}.get(kind, 512)
+    relief[::course] *= 0.85
+    if kind == "stone":
+        for row in range(0, 512, course):
+            relief[row : row + course, 9 * (row // course % 2) :: 18] *= 0.88
+    grey = Image.fromarray(relief.clip(120, 255).astype(np.uint8))
+    return Image.merge("RGB", (grey, grey, grey))
 
 
-def _floors(p: Painter, b: Building, rng: np.random.Generator, shop: bool) -> None:
+lettering = lru_cache(maxsize=16)(ImageFont.load_default)  # Pillow's own font: pictures do not depend on the machine
+
+
+def front(b: Building, width: float) -> Wall:
+    """The full face of a house, with its gable or mansard."""
+    f, up = b.family, b.height
+    rise = {"gable": width * 0.5, "stepped": width * 0.5 + 0.6, "mansard": MANSARD}.get(f.roof, 0.0)
+    wall = Wall(b, width, {"": rise, "church": width * 0.55, "tower": 0.0}[b.landmark], 1)
+    if b.landmark:
+        _landmark(wall, up, b.landmark == "church")
+        return wall
+    count = max(int((width - 0.8) / f.bay), 1)
+    step = (width - 0.8) / count
+    bays = [0.4 + (k + 0.5) * step for k in range(count)]  # their middles
+    _floors(wall, b.floors, bays, step)
+    _ground(wall, bays, step)
+    if f.roof in ("gable", "stepped"):
+        _gable(wall, up, rise)
+        return wall
+    wall.rect(0, up - 0.5, width, up - 0.35, tone(f.trim, 0.6))
+    wall.rect(0, up - 0.35, width, up, tone(f.trim, 0.92))
+    wall.ledges.append((0, width, up))
+    wall.rect(0, up, width, up + rise, f.roof_colour)
+    for x in bays if f.roof == "mansard" else ():
+        wall.rect(x - 0.75, up + 0.3, x + 0.75, up + 2.2, tone(f.trim, 0.95))
+        wall.pane(x - 0.5, up + 0.4, x + 0.5, up + 1.9, GLASS)
+        wall.ledges.append((x - 0.8, x + 0.8, up + 2.2))
+    return wall
+
+
+def side(b: Building, width: float) -> Wall:
+    """A plain side wall: few windows, sometimes a wall painting of coloured discs."""
+    wall = Wall(b, width, MANSARD if b.family.roof == "mansard" and not b.landmark else 0.0, 2)
+    rng = wall.rng
+    wall.rect(0, b.height, width, wall.height, b.family.roof_colour)
+    if b.mural:
+        high = min(b.height - 1.0, 9.0)
+        wall.rect(0.6, 0.8, width - 0.6, high, SIGN_COLOURS[b.seed % 5])
+        for k, (x, y, r) in enumerate(rng.uniform((2.5, 2.7, 0.5), (width - 2.5, high - 1.8, 1.8), (9, 3)).tolist()):
+            wall.disc(x, y, r, tone(SIGN_COLOURS[k % 8], 1.1))
+        return wall
+    for floor in range(b.floors):
+        for x in np.arange(1.6, width - 1.6, b.family.bay * 2):
+            if rng.random() < 0.35:
+                wall.window(float(x), floor * b.family.storey + 1.2, 0.9, 1.4)
+    return wall
+
+
+def _floors(wall: Wall, floors: int, bays: list[float], step: float) -> None:
     """The grid of windows above the ground floor."""
-    f = b.family
-    usable = p.width - 0.8
-    count = max(int(usable / f.bay), 1)
-    step = usable / count
-    band = rng.random() < 0.4
-    railing = rng.random(b.floors) < f.balconies
-    for floor in range(1, b.floors):
+    f, rng, w = wall.family, wall.rng, wall.width
+    band, railing, tall = rng.random() < 0.4, rng.random(floors) < f.balconies, f.window == "french"
+    wide, high = min(step * 0.5, 1.15), (2.2 if tall else 1.55)
+    for floor in range(1, floors):
         y = floor * f.storey
-        if f.window == "curtain":
-            p.rect(0.3, y + 0.5, p.width - 0.3, y + f.storey - 0.1, tone((96, 122, 142), float(rng.uniform(0.8, 1.1))))
-            for k in range(count):
-                x = 0.4 + k * step
-                if rng.random() < 0.35:
-                    p.rect(
-                        x, y + 0.5, x + step, y + f.storey - 0.1, tone((132, 158, 172), float(rng.uniform(0.6, 1.2)))
-                    )
-                p.wall.lights.append(p.box(x + 0.1, y + 0.5, x + step - 0.1, y + f.storey - 0.1))
-                p.rect(x - 0.06, y + 0.2, x + 0.06, y + f.storey, f.trim)
-            continue
-        if f.window == "ribbon":
-            p.rect(0.6, y + 0.9, p.width - 0.6, y + 2.3, tone((88, 104, 118), float(rng.uniform(0.8, 1.1))))
-            for k in range(count):
-                x = 0.4 + k * step
-                p.wall.lights.append(p.box(max(x, 0.6) + 0.1, y + 0.9, x + step - 0.1, y + 2.3))
-                if rng.random() < 0.3:
-                    p.rect(x + 0.1, y + 1.5, x + step - 0.1, y + 2.3, (196, 190, 180))
-                p.rect(x - 0.07, y + 0.9, x + 0.07, y + 2.3, f.trim)
-            p.rect(0.4, y + 0.75, p.width - 0.4, y + 0.9, tone(f.trim, 0.9))
+        if f.window in ("curtain", "ribbon"):  # glass from wall to wall
+            low, top = (y + 0.5, y + f.storey - 0.1) if f.window == "curtain" else (y + 0.9, y + 2.3)
+            wall.rect(0.2, low - 0.2, w - 0.2, top, tone(f.trim, 0.9))
+            for x in bays:
+                glass = (142, 160, 170) if rng.random() < 0.35 else (96, 122, 142)
+                wall.pane(
+                    x - step / 2 + 0.06, low, x + step / 2 - 0.06, top, tone(glass, float(rng.uniform(0.75, 1.15)))
+                )
             continue
         if band:
-            p.rect(0, y - 0.1, p.width, y + 0.12, tone(f.trim, 0.88))
-        tall = f.window == "french"
-        w, h = min(step * 0.5, 1.15), (2.2 if tall else 1.55)
-        for k in range(count):
-            x = 0.4 + (k + 0.5) * step - w / 2
-            window(p, f, x, y + (0.25 if tall else 0.85), w, h, rng)
-            if tall and not railing[floor]:
-                p.rect(x - 0.15, y + 0.25, x + w + 0.15, y + 0.33, f.accent)
-                p.rect(x - 0.15, y + 1.0, x + w + 0.15, y + 1.1, f.accent)
+            wall.rect(0, y - 0.1, w, y + 0.12, tone(f.trim, 0.88))
+        for x in bays:
+            wall.window(x - wide / 2, y + (0.25 if tall else 0.85), wide, high)
         if railing[floor]:
-            start, end = (0.2, p.width - 0.2) if tall else (0.4 + step * 0.1, 0.4 + step * max(1, count - 1) * 0.95)
-            p.rect(start, y - 0.05, end, y + 0.2, tone(f.trim, 0.75))
-            p.rect(start, y + 1.0, end, y + 1.1, f.accent)
+            start, end = (0.2, w - 0.2) if tall else (bays[0] - step * 0.4, bays[-1] - step * 0.4)
+            wall.rect(start, y - 0.05, end, y + 0.2, tone(f.trim, 0.75))
+            wall.rect(start, y + 1.0, end, y + 1.1, f.accent)
             for x in np.arange(start, end, 0.27):
-                p.rect(float(x), y + 0.2, float(x) + 0.07, y + 1.0, f.accent)
+                wall.rect(float(x), y + 0.2, float(x) + 0.07, y + 1.0, f.accent)
 
 
-def _ground(p: Painter, b: Building, rng: np.random.Generator, shop: bool, colour: RGB) -> None:
-    """Door, and a shop with sign and awning or plain windows."""
-    f = b.family
-    w = p.width
-    door = float(rng.choice([0.7, w - 1.9, w / 2 - 0.6]))
-    paint = SIGN_COLOURS[int(rng.integers(len(SIGN_COLOURS)))]
-    if shop:
-        p.rect(0.2, 0, w - 0.2, f.storey - 0.15, tone(paint, 0.8) if rng.random() < 0.6 else tone(f.trim, 0.7))
+def _ground(wall: Wall, bays: list[float], step: float) -> None:
+    """A door, and a shop with its sign and awning or plain windows."""
+    f, rng, w, top = wall.family, wall.rng, wall.width, wall.family.storey
+    door, paint = float(rng.choice([0.7, w - 1.9, w / 2 - 0.6])), SIGN_COLOURS[int(rng.integers(len(SIGN_COLOURS)))]
+    if rng.random() < f.shops and w > 4.5:
+        wall.rect(0.2, 0, w - 0.2, top - 0.15, tone(paint, 0.8) if rng.random() < 0.6 else tone(f.trim, 0.7))
         for x0, x1 in ((0.5, door - 0.25), (door + 1.45, w - 0.5)):
             if x1 - x0 > 0.8:
-                p.rect(x0, 0.5, x1, f.storey - 1.05, (70, 82, 90))
-                p.rect(x0, 0.5, x1, 1.1, (112, 104, 92))
-                for x in np.arange(x0 + 0.2, x1 - 0.3, 0.5):
-                    p.rect(
-                        float(x),
-                        0.5,
-                        float(x) + 0.3,
-                        float(rng.uniform(0.8, 1.5)),
-                        tone(SIGN_COLOURS[int(rng.integers(8))], 0.9),
-                    )
-                p.wall.shops.append(p.box(x0, 0.5, x1, f.storey - 1.05))
-        p.rect(0.2, f.storey - 0.95, w - 0.2, f.storey - 0.2, paint)
-        ink: RGB = (246, 240, 224) if sum(paint) < 420 else (44, 40, 44)
+                wall.pane(x0, 0.5, x1, top - 1.05, (70, 82, 90), 0.85)
+        wall.rect(0.2, top - 0.95, w - 0.2, top - 0.2, paint)
         word = SIGNS[int(rng.integers(len(SIGNS)))]
-        p.text(w / 2, f.storey - 0.6, min(0.62, (w - 1.0) / (0.62 * len(word))), word, ink)
-        if rng.random() < 0.45:
-            stripes = (paint, (238, 232, 220))
-            n = max(int(w / 0.6), 2)
-            for k in range(n):
-                x0, x1 = 0.2 + k * (w - 0.4) / n, 0.2 + (k + 1) * (w - 0.4) / n
-                p.rect(x0, f.storey - 1.55, x1, f.storey - 0.95, stripes[k % 2])
-            p.rect(0.2, f.storey - 1.62, w - 0.2, f.storey - 1.5, tone(paint, 0.6))
-            p.wall.ledges.append((0.2 * PX, (w - 0.2) * PX, (p.height - f.storey + 0.95) * PX))
+        font = lettering(max(int(min(0.62, (w - 1.0) / (0.62 * len(word))) * PX), 5))
+        at, ink = (w / 2 * PX, (wall.height - top + 0.6) * PX), PAPER if sum(paint) < 420 else INK
+        wall.draw.text(at, word, fill=ink, font=font, anchor="mm")
+        stripe = (w - 0.4) / max(int(w / 0.6), 2)
+        for k in range(max(int(w / 0.6), 2) if rng.random() < 0.45 else 0):  # an awning
+            x = 0.2 + k * stripe
+            wall.rect(x, top - 1.6, x + stripe, top - 0.95, PAPER if k % 2 else paint)
+            wall.ledges.append((x, x + stripe, top - 0.95))
     else:
-        count = max(int((w - 0.8) / f.bay), 1)
-        step = (w - 0.8) / count
-        for k in range(count):
-            x = 0.4 + (k + 0.5) * step - 0.55
-            if abs(x - door) > 1.5:
-                window(p, f, x, 1.0, min(1.1, step * 0.55), 1.4, rng)
+        for x in bays:
+            if abs(x - door - 0.55) > 1.5:
+                wall.window(x - 0.55, 1.0, min(1.1, step * 0.55), 1.4)
     leaf = f.accent if rng.random() < 0.6 else paint
-    p.rect(door - 0.15, 0, door + 1.3, 2.5, tone(f.trim, 0.85))
-    p.rect(door, 0, door + 1.15, 2.1, leaf)
-    p.rect(door + 0.15, 1.1, door + 1.0, 1.9, tone(leaf, 0.7))
-    p.rect(door, 2.15, door + 1.15, 2.4, (92, 104, 112))
-    p.wall.lights.append(p.box(door, 2.15, door + 1.15, 2.4))
+    wall.rect(door - 0.15, 0, door + 1.3, 2.5, tone(f.trim, 0.85))
+    wall.rect(door, 0, door + 1.15, 2.1, leaf)
+    wall.rect(door + 0.15, 1.1, door + 1.0, 1.9, tone(leaf, 0.7))
+    wall.pane(door, 2.15, door + 1.15, 2.4, GLASS)
 
 
-def _gable(p: Painter, b: Building, extra: float, rng: np.random.Generator) -> None:
-    """Cuts the wall's top into a triangle or steps, and draws the attic's window and the coping."""
-    w, eave, top = p.width, b.height, p.height - 0.05
-    alpha = Image.new("L", p.size, 255)
-    cut = ImageDraw.Draw(alpha)
-    edge: list[tuple[float, float]] = [(0, eave)]
-    if b.family.roof == "stepped":
-        steps = 4
-        for k in range(steps):
-            x, y = w * 0.5 * (k / (steps + 0.8)), eave + (k + 1) * (top - eave) / (steps + 1)
-            edge += [(x, y), (w * 0.5 * ((k + 1) / (steps + 0.8)), y)]
-        edge += [(edge[-1][0], top)]
-        edge += [(w - x, y) for x, y in reversed(edge)]
+def _gable(wall: Wall, eave: float, rise: float) -> None:
+    """Cuts the wall's top into a triangle or steps, with the attic's window."""
+    w, top = wall.width, eave + rise - 0.05
+    wall.window(w / 2 - 0.45, eave + rise * 0.12, 0.9, min(1.3, rise * 0.45))
+    if wall.family.roof == "gable":
+        wall.cut([(0, eave), (w / 2, top), (w, eave)])
+        return
+    left = [(0.0, eave)]
+    for k in range(1, 6):
+        high = eave + k * (top - eave) / 5
+        left += [(left[-1][0], high), (w * 0.5 * k / 5.8, high)]
+        wall.ledges += [(left[-2][0], left[-1][0], high), (w - left[-1][0], w - left[-2][0], high)]
+    wall.cut([*left, *[(w - x, y) for x, y in reversed(left)]])
+
+
+def _landmark(wall: Wall, eave: float, church: bool) -> None:
+    """A church's portal, rose window and gable, or a tower's windows under its clock."""
+    f, middle, y = wall.family, wall.width / 2, 6.6 if church else eave - 3.2
+    for x, low in ((-0.64, 2.6), (0.38, 2.6)) if church else [(-0.17, float(v)) for v in np.arange(3.5, y - 3, 4)]:
+        wall.window(middle * (1 + x), low, middle * 0.26, 2.4)
+    wall.pane(middle - 0.6, y - 0.6, middle + 0.6, y + 0.6, GLASS, 0.85)
+    wall.disc(middle, y, 1.4, tone(f.trim, 0.9))
+    wall.disc(middle, y, 1.15, (72, 66, 96) if church else PAPER)
+    if church:
+        wall.rect(middle - 1.5, 0, middle + 1.5, 3.2, tone(f.trim, 0.9))
+        wall.rect(middle - 1.1, 0, middle + 1.1, 2.9, f.accent)
+        wall.cut([(0, eave), (middle, wall.height), (wall.width, eave)])
     else:
-        edge += [(w / 2, top), (w, eave)]
-    outside = [(0.0, p.height), *edge, (w, p.height)]
-    cut.polygon([(x * PX, (p.height - y) * PX) for x, y in outside], fill=0)
-    line = [(x * PX, (p.height - y) * PX) for x, y in edge]
-    p.draw.line(line, fill=tone(b.family.trim, 0.95), width=5 if b.family.roof == "gable" else 4)
-    p.wall.ledges += [(a[0], c[0], a[1]) for a, c in itertools.pairwise(line) if abs(a[1] - c[1]) < 1]
-    window(p, b.family, w / 2 - 0.45, eave + extra * 0.12, 0.9, min(1.3, extra * 0.45), rng)
-    p.wall.alpha = alpha
+        wall.rect(middle - 0.07, y, middle + 0.07, y + 0.95, INK)  # the clock's hands
+        wall.rect(middle, y - 0.07, middle + 0.7, y + 0.07, INK)
+        for ledge in (eave - 0.4, eave - 1.6, eave - 5.0):
+            wall.rect(0, ledge, wall.width, ledge + 0.3, tone(f.trim, 0.9))

@@ -1,15 +1,19 @@
-"""A place of the miniature: its houses, trees and furniture, made from its seed alone.
+"""A street of the miniature: its houses, trees and furniture, made from its seed alone.
 
-Invariant: everything here is the place's identity; hours, seasons, traffic and cameras are added by the photo.
+Invariant: everything here is the identity of the street's places; hours, seasons, traffic and cameras belong to photos.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from shards.sources.miniature.styles import TOWNS, Family, Town
+from shards.sources.miniature.towns import TOWNS, Family, Town
+
+REACH = 62.0  # metres of houses built to either side of where photographers stand
+FRONTS = {"row": (17, 22), "crossing": (17, 21), "avenue": (8, 11), "square": (26, 34)}  # metres, axis to houses
+HEIGHTS = {"lamp": (5.2, 5.5), "bench": (0.9, 0.9), "roadsign": (2.6, 2.6), "kiosk": (2.7, 2.7), "hedge": (1.1, 1.1)}
 
 
 @dataclass(frozen=True)
@@ -31,7 +35,7 @@ class Building:
 
 @dataclass(frozen=True)
 class Thing:
-    """A tree, lamp, sign, bench, hedge or statue standing at (x, z), `size` metres high."""
+    """A tree, lamp, sign, bench, kiosk or hedge standing at (x, z), `size` metres high."""
 
     kind: str
     x: float
@@ -40,198 +44,143 @@ class Thing:
     variant: int
 
 
-@dataclass(frozen=True)
+@dataclass
 class Place:
-    """Everything that stays: `kind` is row, crossing, avenue or square; `view` the heading photographers choose."""
+    """A street, `length` metres of which are photographed: along x, or along z for an avenue.
+
+    Args:
+        kind: a key of `FRONTS`; view: the heading photographers choose, in radians from +z.
+        kerb, front: metres from the street's axis to the road's edge and to the houses.
+        gaps: both edges of each side street, in metres along the row; zebras: where one may cross it.
+        skyline: bearing (radians), width, height, distance (metres); hills: phases of the far ridge, if any.
+    """
 
     town: Town
     kind: str
-    buildings: tuple[Building, ...]
-    things: tuple[Thing, ...]
-    skyline: tuple[tuple[float, float, float, float], ...]  # bearing (rad), width (m), height (m), distance (m)
-    hills: tuple[float, ...]  # phases of the far ridge; empty without hills
-    kerb: float  # distance of the road's edge from the axis, metres
-    front: float  # distance of the houses' line from the axis, metres
-    gap: tuple[float, float] | None  # a side street's edges along the row, metres
-    zebra: float | None  # where a crossing lies along the street
-    view: float  # radians
-    heading: float  # compass bearing of +z, degrees
+    length: float
+    front: float
+    kerb: float
+    view: float
+    gaps: list[tuple[float, float]] = field(default_factory=list)
+    zebras: list[float] = field(default_factory=list)
+    buildings: list[Building] = field(default_factory=list)
+    things: list[Thing] = field(default_factory=list)
+    skyline: list[list[float]] = field(default_factory=list)
+    hills: list[float] = field(default_factory=list)
 
 
-def make_place(town: int, seed: tuple[int, ...]) -> Place:
-    """The place with this seed in this town."""
-    rng = np.random.default_rng(seed)
-    style = TOWNS[town]
-    kind = str(rng.choice(["row", "crossing", "avenue", "square"], p=[0.36, 0.26, 0.24, 0.14]))
-    heading = float(rng.uniform(0, 360))
-    front = {"row": rng.uniform(17, 22), "crossing": rng.uniform(17, 21), "avenue": rng.uniform(8, 11)}.get(
-        kind, rng.uniform(26, 34)
-    )
-    buildings: list[Building] = []
-    gap = None
+def kind_of(seed: tuple[int, ...], length: float) -> str:
+    """row, crossing, avenue or square; a street of several places is no square."""
+    shares = [0.4, 0.35, 0.25, 0.0] if length else [0.36, 0.26, 0.24, 0.14]
+    return str(np.random.default_rng(seed).choice(list(FRONTS), p=shares))
+
+
+def make_place(town: int, seed: tuple[int, ...], length: float = 0.0) -> Place:
+    """The street with this seed in this town; with a length of 0 it is a single place."""
+    rng, style, kind = np.random.default_rng([*seed, 1]), TOWNS[town], kind_of(seed, length)
+    front, kerb, view, zebra = rng.uniform(
+        (FRONTS[kind][0], 2.8, -1, -9), (FRONTS[kind][1], 4.5, 1, 9 + length)
+    ).tolist()
+    kerb = 11.0 if kind == "square" else front - kerb
+    view *= 0.22 if kind == "avenue" else 0.45
+    place = Place(style, kind, length, front, kerb, view, zebras=[zebra] if rng.random() < 0.35 else [])
     if kind == "avenue":
-        for side in (-1, 1):
-            _line(buildings, rng, style, -14.0, 100.0, float(front), side)
+        for side, face in ((-1, "east"), (1, "west")):
+            _houses(place, rng, -14.0, 100.0 + length, side * front, face)
         if rng.random() < 0.55:
-            _landmark(buildings, rng, style, 0.0, 104.0)
+            _landmark(place, rng, 0.0, 104.0 + length)
     else:
-        if kind == "crossing":
-            middle, wide = float(rng.uniform(-8, 8)), float(rng.uniform(8, 12))
-            gap = (middle - wide / 2, middle + wide / 2)
-        _row(buildings, rng, style, float(front), gap)
-        if gap:
-            for side, edge in ((-1, gap[0]), (1, gap[1])):
-                _line(buildings, rng, style, float(front) + 16.0, 100.0, abs(edge), side, shift=edge)
+        middle = float(rng.uniform(-8, 8)) if kind == "crossing" else REACH + length
+        while middle < REACH + length:
+            half = float(rng.uniform(4, 6))
+            place.gaps.append((middle - half, middle + half))
+            middle += float(rng.uniform(45, 75)) if length else 2 * REACH
+        edges = [-REACH, *[edge for gap in place.gaps for edge in gap], REACH + length]
+        for start, end in zip(edges[::2], edges[1::2], strict=True):
+            _houses(place, rng, start, end, front, "south")
+        for left, right in place.gaps:
+            _houses(place, rng, front + 16.0, 100.0, left, "east")
+            _houses(place, rng, front + 16.0, 100.0, right, "west")
+            if not length:
+                place.view = float(np.arctan2((left + right) * 0.3, front)) + view * 0.45
         if kind == "square":
-            _landmark(buildings, rng, style, float(rng.uniform(-7, 7)), float(front) - float(rng.uniform(0, 4)))
-    things = _furnish(rng, style, kind, float(front), gap)
-    skyline = tuple(
-        (float(rng.uniform(-1.6, 1.6)), float(w), float(h), float(rng.uniform(180, 420)))
-        for w, h in _silhouettes(rng, style.skyline)
-    )
-    hills = tuple(rng.uniform(0, 6.28, 4).tolist()) if style.skyline == "hills" or rng.random() < 0.25 else ()
-    view = float(rng.uniform(-0.45, 0.45)) if kind != "avenue" else float(rng.uniform(-0.22, 0.22))
-    if gap:
-        view = float(np.arctan2((gap[0] + gap[1]) / 2 * 0.6, front)) + float(rng.uniform(-0.2, 0.2))
-    kerb = float(front) - float(rng.uniform(2.8, 4.5)) if kind != "square" else 11.0
-    zebra = float(rng.uniform(-9, 9)) if rng.random() < 0.35 else None
-    return Place(
-        style, kind, tuple(buildings), tuple(things), skyline, hills, kerb, float(front), gap, zebra, view, heading
-    )
+            _landmark(place, rng, float(rng.uniform(-7, 7)), front - float(rng.uniform(0, 4)))
+    _furnish(place, rng)
+    most, widest, lowest, highest = style.skyline
+    low, high = (-1.6, widest / 3, lowest, 180), (1.6, widest, highest, 420)
+    place.skyline = rng.uniform(low, high, (int(rng.integers(most // 2, most)), 4)).tolist()
+    if rng.random() < style.hills:
+        place.hills = rng.uniform(0, 6.28, 3).tolist()
+    return place
 
 
-def _house(rng: np.random.Generator, style: Town) -> tuple[Family, float, int, float]:
-    family = style.families[int(rng.choice(len(style.families), p=style.shares))]
-    floors = int(rng.integers(family.floors[0], family.floors[1] + 1))
-    return family, float(rng.uniform(*family.width)), floors, floors * family.storey + 0.9
+def _houses(place: Place, rng: np.random.Generator, at: float, end: float, line: float, face: str) -> None:
+    """Houses from `at` to `end`: along x at z = `line`, facing the camera (south), or along z at x = `line`."""
+    while end - at > 4.5:
+        family = place.town.families[int(rng.choice(len(place.town.families), p=place.town.shares))]
+        width, floors = float(rng.uniform(*family.width)), int(rng.integers(family.floors[0], family.floors[1] + 1))
+        width = min(width if end - at - width > 4.5 else end - at, family.width[1] * 1.25)
+        back, deep = float(rng.choice([0.0, 0.0, 0.0, 0.8, 2.0])), float(rng.uniform(10, 15))
+        fronts: tuple[str, ...] = (face,)
+        if face == "south":
+            box = (at, at + width, line + back, line + back + deep)
+            if any(abs(at + width - a) < 1 or abs(at - b) < 1 for a, b in place.gaps):
+                fronts = ("south", "east", "west")  # at a corner
+        else:
+            x0, x1 = sorted((line + back, line + back + deep) if face == "west" else (line - back, line - back - deep))
+            box = (x0, x1, at, at + width)
+        seed, mural = int(rng.integers(1 << 31)), bool(rng.random() < 0.07)
+        height = floors * family.storey + 0.9
+        place.buildings.append(Building(*box, height, family, floors, seed, fronts, mural=mural))
+        at += width + (float(rng.uniform(2.0, 5.0)) if not place.gaps and rng.random() < 0.13 else 0.0)
 
 
-def _row(
-    out: list[Building], rng: np.random.Generator, style: Town, front: float, gap: tuple[float, float] | None
-) -> None:
-    """Houses side by side along x, facing the camera (south)."""
-    spans = [(-62.0, gap[0]), (gap[1], 62.0)] if gap else [(-62.0, 62.0)]
-    for start, end in spans:
-        x = start
-        while end - x > 4.5:
-            family, width, floors, height = _house(rng, style)
-            width = min(width, end - x) if end - x - width > 4.5 else end - x
-            width = min(width, family.width[1] * 1.25)
-            setback = float(rng.choice([0.0, 0.0, 0.0, 0.6, 1.5, 3.0]))
-            if gap:  # corner houses show both faces to the streets
-                fronts: tuple[str, ...] = (
-                    ("south", "east", "west") if abs(x + width - gap[0]) < 1 or abs(x - gap[1]) < 1 else ("south",)
-                )
-            else:
-                fronts = ("south",)
-            depth = float(rng.uniform(10, 15))
-            out.append(
-                Building(x, x + width, front + setback, front + setback + depth, height, family, floors,
-                         int(rng.integers(1 << 31)), fronts, mural=bool(rng.random() < 0.08))
-            )  # fmt: skip
-            x += width
-            if not gap and rng.random() < 0.14:
-                x += float(rng.uniform(2.0, 5.0))
-
-
-def _line(
-    out: list[Building], rng: np.random.Generator, style: Town, z: float, end: float, edge: float, side: int,
-    shift: float | None = None,
-) -> None:  # fmt: skip
-    """Houses along z on one side of a street that runs away from the camera."""
-    face = "east" if side < 0 else "west"
-    while z < end:
-        family, width, floors, height = _house(rng, style)
-        setback = float(rng.choice([0.0, 0.0, 0.0, 0.8, 2.0]))
-        at = shift if shift is not None else side * edge
-        near, far = at + side * setback, at + side * (setback + 12.0)
-        out.append(
-            Building(min(near, far), max(near, far), z, z + width, height, family, floors,
-                     int(rng.integers(1 << 31)), (face,), mural=bool(rng.random() < 0.05))
-        )  # fmt: skip
-        z += width + (float(rng.uniform(2, 6)) if rng.random() < 0.12 else 0.0)
-
-
-def _landmark(out: list[Building], rng: np.random.Generator, style: Town, x: float, z: float) -> None:
-    """A church or a town hall's tower, built of the town's most solemn family."""
-    family = style.families[2]
-    seed = int(rng.integers(1 << 31))
-    nave, high, width = float(rng.uniform(9, 12)), float(rng.uniform(18, 28)), float(rng.uniform(4.5, 6))
-    kept = [
-        b
-        for b in out
-        if b.x1 < x - nave / 2 - width - 1 or b.x0 > x + nave / 2 + width + 1 or b.z0 > z + 12 or b.z1 < z - 2
+def _landmark(place: Place, rng: np.random.Generator, x: float, z: float) -> None:
+    """A church with its tower, built of the town's most solemn family, in place of the houses there."""
+    nave, width, high, eaves = rng.uniform((9, 4.5, 18, 8), (12, 6, 28, 11)).tolist()
+    half = nave / 2 + width + 1
+    place.buildings = [
+        b for b in place.buildings if b.x1 < x - half or b.x0 > x + half or b.z0 > z + 12 or b.z1 < z - 2
     ]
-    out[:] = kept
-    out.append(
-        Building(
-            x - nave / 2, x + nave / 2, z, z + 16, float(rng.uniform(8, 11)), family, 1, seed, ("south",), "church"
-        )
-    )
     left = x - nave / 2 - width if rng.random() < 0.5 else x + nave / 2
-    out.append(
-        Building(
-            left, left + width, z - 0.5, z - 0.5 + width, high, family, 4, seed + 1, ("south", "west", "east"), "tower"
-        )
+    family, seed = place.town.families[2], int(rng.integers(1 << 31))
+    church = (x - nave / 2, x + nave / 2, z, z + 16, eaves, family, 1, seed, ("south",), "church")
+    tower = (
+        left,
+        left + width,
+        z - 0.5,
+        z - 0.5 + width,
+        high,
+        family,
+        4,
+        seed + 1,
+        ("south", "west", "east"),
+        "tower",
     )
+    place.buildings += [Building(*church), Building(*tower)]
 
 
-def _silhouettes(rng: np.random.Generator, kind: str) -> list[tuple[float, float]]:
-    if kind == "towers":
-        return [(rng.uniform(14, 34), rng.uniform(30, 120)) for _ in range(int(rng.integers(8, 16)))]
-    if kind == "spires":
-        return [(rng.uniform(5, 30), rng.uniform(18, 55)) for _ in range(int(rng.integers(3, 9)))]
-    return [(rng.uniform(10, 26), rng.uniform(14, 30)) for _ in range(int(rng.integers(3, 8)))]
-
-
-def _furnish(
-    rng: np.random.Generator, style: Town, kind: str, front: float, gap: tuple[float, float] | None
-) -> list[Thing]:
+def _furnish(place: Place, rng: np.random.Generator) -> None:
     """Trees, lamps and small things on the pavements."""
-    things: list[Thing] = []
-    pick = lambda: style.trees[int(rng.integers(len(style.trees)))]  # noqa: E731
-    if kind == "avenue":
+    front, end, trees = place.front, place.length, place.town.trees
+
+    def put(kind: str, x: float, z: float) -> None:
+        size = float(rng.uniform(*HEIGHTS.get(kind, (4.5, 8.5))))
+        place.things.append(Thing(kind, float(x), float(z), size, int(rng.integers(8))))
+
+    tree = trees[int(rng.integers(len(trees)))]
+    if place.kind == "avenue":
         for side in (-1, 1):
-            if rng.random() < 0.6:
-                species, step = pick(), float(rng.uniform(8, 13))
-                for z in np.arange(float(rng.uniform(13, 18)), 90, step):
-                    if rng.random() < 0.85:
-                        things.append(
-                            Thing(
-                                species,
-                                side * (front - 2.4),
-                                float(z + rng.uniform(-1, 1)),
-                                float(rng.uniform(5, 8.5)),
-                                int(rng.integers(4)),
-                            )
-                        )
-            for z in np.arange(float(rng.uniform(10, 16)), 90, 22.0):
-                things.append(Thing("lamp", side * (front - 3.2), float(z), 5.5, 0))
-    else:
-        if rng.random() < 0.75:
-            species, line = pick(), front - float(rng.uniform(1.8, 3.2))
-            for x in rng.uniform(-26, 26, int(rng.integers(2, 6))):
-                if gap is None or not gap[0] < x < gap[1]:
-                    things.append(Thing(species, float(x), line, float(rng.uniform(4.5, 8.5)), int(rng.integers(4))))
-        for x in np.arange(float(rng.uniform(-24, -14)), 26, 15.0):
-            things.append(Thing("lamp", float(x), front - 3.4, 5.2, 0))
-        if rng.random() < 0.4:
-            things.append(Thing("hedge", float(rng.uniform(-14, 10)), front - 0.9, 1.1, int(rng.integers(4, 10))))
-        for _ in range(int(rng.integers(1, 4))):
-            what = str(rng.choice(["bench", "roadsign", "postbox", "bollards", "kiosk"], p=[0.3, 0.25, 0.15, 0.2, 0.1]))
-            things.append(
-                Thing(
-                    what, float(rng.uniform(-14, 14)), front - float(rng.uniform(1.2, 3.2)), 1.0, int(rng.integers(8))
-                )
-            )
-        if kind == "square":
-            things.append(
-                Thing(
-                    "statue",
-                    float(rng.uniform(-8, 8)),
-                    front - float(rng.uniform(7, 13)),
-                    float(rng.uniform(4, 6)),
-                    int(rng.integers(4)),
-                )
-            )
-    return things
+            for z in np.arange(float(rng.uniform(13, 18)), 90 + end, float(rng.uniform(8, 13))):
+                if rng.random() < 0.5:
+                    put(tree, side * (front - 2.4), z)
+            for z in np.arange(float(rng.uniform(10, 16)), 70 + end, 22.0):
+                put("lamp", side * (front - 3.2), z)
+        return
+    for x in rng.uniform(-26, 26 + end, int(rng.integers(0, 6) * (1 + end / 52))):
+        if not any(a < x < b for a, b in place.gaps):
+            put(tree, x, front - 2.4)
+    for x in np.arange(float(rng.uniform(-24, -14)), 26 + end, 15.0):
+        put("lamp", x, front - 3.4)
+    for x in rng.uniform(-14, 14 + end, int(rng.integers(1, 5) * (1 + end / 28))):
+        put(str(rng.choice(list(HEIGHTS)[1:], p=[0.32, 0.32, 0.12, 0.24])), x, front - float(rng.uniform(0.9, 3.2)))

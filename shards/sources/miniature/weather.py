@@ -1,22 +1,24 @@
-"""Seasons, hours and weather of a photo, and the light they throw on a surface.
+"""Season, hour and weather of a photo, the light they throw on a surface, and the lens that takes the picture.
 
-Invariant: conditions belong to a photo, never to the place in it.
+Invariant: conditions and lens belong to a photo, never to the place in it.
 """
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from PIL import Image
 
 from shards.sources.miniature.camera import Array
+from shards.sources.miniature.towns import RGB
 
-Colour = tuple[float, float, float]
 SEASON_MONTHS = {"spring": (3, 4, 5), "summer": (6, 7, 8), "autumn": (9, 10, 11), "winter": (12, 1, 2)}
+Colour = tuple[float, float, float]
 # sky at the zenith, sky at the horizon, ambient light, sunlight, height of the sun (degrees), its azimuth (degrees)
 HOURS: dict[str, tuple[Colour, Colour, Colour, Colour, float, float]] = {
     "morning": ((112, 158, 214), (236, 222, 200), (0.60, 0.62, 0.68), (0.52, 0.44, 0.32), 24, 105),
@@ -25,6 +27,15 @@ HOURS: dict[str, tuple[Colour, Colour, Colour, Colour, float, float]] = {
     "dusk": ((72, 78, 128), (244, 164, 110), (0.52, 0.47, 0.53), (0.30, 0.16, 0.08), 6, 275),
     "night": ((14, 19, 42), (70, 60, 66), (0.29, 0.29, 0.37), (0.0, 0.0, 0.0), 30, 180),
 }
+# share of grey that each sky lays over its colours, and the air's extinction in 1/metre
+SKIES = {"clear": (0.0, 0.0011), "overcast": (0.85, 0.002), "rain": (0.95, 0.006), "fog": (1.0, 0.026),
+         "snowfall": (0.9, 0.009)}  # fmt: skip
+# how often each of SEASON_MONTHS, HOURS and SKIES is met, by purpose of the photo
+SHARES: dict[str, tuple[list[float], list[float], list[float]]] = {
+    "train": ([0.25, 0.25, 0.25, 0.25], [0.2, 0.25, 0.23, 0.15, 0.17], [0.5, 0.24, 0.13, 0.07, 0.06]),
+    "database": ([0.5, 0.5, 0.0, 0.0], [0.33, 0.34, 0.33, 0.0, 0.0], [0.7, 0.3, 0.0, 0.0, 0.0]),  # a fair survey
+    "queries": ([0.15, 0.15, 0.35, 0.35], [0.17, 0.18, 0.18, 0.2, 0.27], [0.36, 0.26, 0.2, 0.1, 0.08]),
+}
 
 
 @dataclass(frozen=True)
@@ -32,8 +43,8 @@ class Conditions:
     """What the day was like.
 
     Args:
-        season: a key of `SEASON_MONTHS`; hour: a key of `HOURS`.
-        sky: clear, overcast, rain, fog or snowfall; snow: whether it lies on the ground and the roofs.
+        season, hour, sky: keys of `SEASON_MONTHS`, `HOURS` and `SKIES`.
+        snow: whether it lies on the ground and the roofs.
         heading: compass bearing of the place's +z axis in degrees, so that the sun stands where it should.
     """
 
@@ -49,40 +60,33 @@ class Conditions:
 
     @cached_property
     def colours(self) -> tuple[Array, Array, Array, Array]:
-        """Zenith, horizon (0..255), ambient and sun (0..1) after the weather's veil."""
+        """Zenith, horizon (0..255), ambient and sun (0..1) behind the weather's grey."""
         zenith, low, ambient, sun = (np.array(c, dtype=np.float64) for c in HOURS[self.hour][:4])
         if self.sky != "clear":
-            veil = {"overcast": 0.85, "rain": 0.95, "fog": 1.0, "snowfall": 0.9}[self.sky]
-            grey = float(zenith.mean() * 0.45 + low.mean() * 0.55) * (0.86 if self.sky == "rain" else 1.0)
-            tint = np.array([0.97, 1.0, 1.05])
-            zenith, low = zenith * (1 - veil) + grey * 0.92 * tint * veil, low * (1 - veil) + grey * 1.04 * tint * veil
-            extra = 0.30 * sun.mean()
-            ambient = ambient * (0.90 if self.sky == "rain" else 1.04) + extra * tint
+            veil, dim = SKIES[self.sky][0], 0.86 if self.sky == "rain" else 1.0
+            grey = float(zenith.mean() * 0.45 + low.mean() * 0.55) * dim * np.array([0.97, 1.0, 1.05])
+            zenith, low = zenith * (1 - veil) + grey * 0.92 * veil, low * (1 - veil) + grey * 1.04 * veil
+            ambient = ambient * (1.04 * dim) + 0.3 * sun.mean()
             sun = sun * (0.15 if self.sky == "overcast" else 0.0)
-        if self.snow and self.hour != "night":
-            ambient = ambient * 1.05
         return zenith, low, ambient, sun
 
     @cached_property
     def to_sun(self) -> Array:
         """[3] unit vector towards the sun in the place's axes."""
         height, azimuth = (math.radians(d) for d in HOURS[self.hour][4:])
-        turn = azimuth - math.radians(self.heading)
-        flat = math.cos(height)
+        turn, flat = azimuth - math.radians(self.heading), math.cos(height)
         return np.array([flat * math.sin(turn), math.sin(height), flat * math.cos(turn)])
-
-    @cached_property
-    def haze(self) -> float:
-        """Extinction in 1/metre."""
-        return {"clear": 0.0011, "overcast": 0.002, "rain": 0.006, "fog": 0.026, "snowfall": 0.009}[self.sky]
 
     def light(self, normal: Array | None) -> Array:
         """[3] light on a surface with this normal; None: something round, lit from all sides."""
         _, _, ambient, sun = self.colours
         if normal is None:
             return np.asarray(ambient + 0.55 * sun)
-        up = 0.9 + 0.1 * float(normal[1])
-        return np.asarray(ambient * up + sun * max(0.0, float(normal @ self.to_sun)))
+        return np.asarray(ambient * (0.9 + 0.1 * float(normal[1])) + sun * max(0.0, float(normal @ self.to_sun)))
+
+    def veil(self, distance: float) -> float:
+        """Share of the air's own colour at this distance in metres."""
+        return 1.0 - math.exp(-SKIES[self.sky][1] * max(distance - 8.0, 0.0))
 
     def relight(self, picture: Image.Image, light: Array, distance: float) -> Image.Image:
         """An RGB picture in this light behind `distance` metres of air."""
@@ -90,13 +94,42 @@ class Conditions:
         (r, g, b), (x, y, z) = (light * (1 - veil)).tolist(), (self.colours[1] * 0.96 * veil).tolist()
         return picture.convert("RGB", (r, 0, 0, x, 0, g, 0, y, 0, 0, b, z))
 
-    def veil(self, distance: float) -> float:
-        """Share of the air's own colour at this distance."""
-        return 1.0 - math.exp(-self.haze * max(distance - 8.0, 0.0))
-
-    def shade(self, colour: Sequence[float], light: Array, distance: float) -> tuple[int, int, int]:
+    def shade(self, colour: Sequence[float], light: Array, distance: float) -> RGB:
         """One colour (0..255) in this light behind `distance` metres of air."""
         veil = self.veil(distance)
-        mixed = np.clip(np.array(colour) * light * (1 - veil) + self.colours[1] * 0.96 * veil, 0, 255)
-        r, g, b = mixed.astype(int).tolist()
-        return r, g, b
+        r, g, b = np.clip(np.array(colour) * light * (1 - veil) + self.colours[1] * 0.96 * veil, 0, 255).tolist()
+        return int(r), int(g), int(b)
+
+
+def draw_conditions(rng: np.random.Generator, heading: float, purpose: str) -> Conditions:
+    """Conditions of a photo taken for `purpose`, a key of `SHARES`."""
+    names = list(SEASON_MONTHS), list(HOURS), list(SKIES)
+    season, hour, sky = (str(rng.choice(n, p=p)) for n, p in zip(names, SHARES[purpose], strict=True))
+    if sky == "snowfall" and season != "winter":
+        sky = "overcast"
+    return Conditions(season, hour, sky, sky == "snowfall" or (season == "winter" and rng.random() < 0.6), heading)
+
+
+@lru_cache(maxsize=4)
+def _noise(width: int, height: int) -> np.ndarray:
+    """[2 * height, 2 * width, 3] unit normal noise, int8 in 1/32."""
+    return np.random.default_rng(99).normal(0, 32, (2 * height, 2 * width, 3)).clip(-127, 127).astype(np.int8)
+
+
+def develop(image: Image.Image, sky: Conditions, rng: np.random.Generator) -> bytes:
+    """The drawing as the JPEG bytes of a photo: sharpness, exposure, colour, noise."""
+    size, night = image.size, sky.hour == "night"
+    sharp = 1.1 - 0.5 * float(rng.uniform(0.0, 1.0)) ** 3 - (0.1 if sky.dark else 0.0)
+    if sharp < 0.9:
+        image = image.resize((int(size[0] * sharp), int(size[1] * sharp))).resize(size, Image.Resampling.BICUBIC)
+    exposure = float(rng.normal(1.06, 0.10)) * (1.15 if night else 1.0)
+    levels = np.linspace(0, 1, 256) ** float(rng.uniform(0.9, 1.12)) * 255 * exposure
+    levels = np.where(levels > 205, 205 + (levels - 205) * 0.55, levels)  # a soft shoulder, as cameras have
+    balance = np.array([[1.0 + rng.normal(0, 0.045)], [1.0], [1.0 + rng.normal(0, 0.05)]])
+    image = image.point(np.clip(levels * balance, 0, 255).astype(int).ravel().tolist())
+    strength, (x, y) = float(rng.uniform(1.0, 3.5)) * (2.2 if night else 1.0), rng.integers(size).tolist()
+    grain = _noise(*size)[y : y + size[1], x : x + size[0]] * np.int16(round(strength * 8)) >> 8
+    store = io.BytesIO()
+    image = Image.fromarray((np.asarray(image) + grain).clip(0, 255).astype(np.uint8))
+    image.save(store, "JPEG", quality=int(rng.integers(72, 93)))
+    return store.getvalue()

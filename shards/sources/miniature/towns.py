@@ -41,8 +41,8 @@ class Town:
     trees: tuple[str, ...]
     paving: RGB
     road: RGB
-    skyline: str  # towers, spires, hills, stacks
-    lamp: str  # lantern, arm, globe
+    skyline: tuple[int, int, int, int]  # most of its far towers, widest, lowest and highest of them in metres
+    hills: float  # share of places with hills behind
     marking: RGB
 
 
@@ -59,7 +59,7 @@ HARBOUR = Town(
         Family(((186, 182, 174), (150, 156, 158)), "panel", "ribbon",
                (210, 212, 212), (190, 96, 52), "flat", (120, 120, 120), (11.0, 16.0), (3, 5), 3.1, 2.6, 0.3),
     ),
-    (0.4, 0.3, 0.2, 0.1), ("round", "poplar"), (158, 142, 130), (98, 94, 94), "spires", "lantern", (226, 224, 214),
+    (0.4, 0.3, 0.2, 0.1), ("round", "poplar"), (158, 142, 130), (98, 94, 94), (9, 30, 18, 55), 0.25, (226, 224, 214),
 )  # fmt: skip
 COAST = Town(
     "Portalba", "PAL",
@@ -73,8 +73,8 @@ COAST = Town(
         Family(((222, 160, 150), (196, 204, 186)), "plaster", "french",
                (246, 238, 226), (120, 70, 60), "eaves", (182, 104, 74), (7.0, 11.0), (3, 5), 3.0, 2.3, 0.5, 0.6),
     ),
-    (0.4, 0.2, 0.15, 0.25), ("palm", "round", "cypress"), (196, 180, 156), (122, 116, 110),
-    "hills", "globe", (232, 230, 222),
+    (0.4, 0.2, 0.15, 0.25), ("palm", "round", "poplar"), (196, 180, 156), (122, 116, 110),
+    (8, 26, 14, 30), 1.0, (232, 230, 222),
 )  # fmt: skip
 BOULEVARD = Town(
     "Graumont", "GRM",
@@ -88,7 +88,8 @@ BOULEVARD = Town(
         Family(((158, 166, 172), (176, 178, 176)), "glass", "curtain",
                (120, 128, 134), (54, 60, 66), "flat", (110, 110, 112), (12.0, 18.0), (4, 6), 3.3, 1.6, 0.3),
     ),
-    (0.45, 0.3, 0.15, 0.1), ("plane", "round"), (178, 172, 162), (106, 104, 102), "spires", "lantern", (230, 230, 226),
+    (0.45, 0.3, 0.15, 0.1), ("round", "poplar"), (178, 172, 162), (106, 104, 102), (9, 30, 18, 55), 0.25,
+    (230, 230, 226),
 )  # fmt: skip
 GRID = Town(
     "Eastgate", "EGT",
@@ -102,7 +103,8 @@ GRID = Town(
         Family(((206, 198, 178), (164, 178, 170), (190, 160, 140)), "timber", "sash",
                (240, 240, 232), (94, 58, 50), "gable", (86, 82, 84), (6.5, 9.0), (2, 3), 3.0, 2.2, 0.2),
     ),
-    (0.45, 0.2, 0.15, 0.2), ("round", "conifer"), (166, 164, 160), (88, 88, 90), "towers", "arm", (222, 186, 70),
+    (0.45, 0.2, 0.15, 0.2), ("round", "conifer"), (166, 164, 160), (88, 88, 90), (16, 34, 30, 120), 0.25,
+    (222, 186, 70),
 )  # fmt: skip
 TOWNS = (HARBOUR, COAST, BOULEVARD, GRID)
 SIGNS = (
@@ -113,3 +115,9 @@ SIGN_COLOURS: tuple[RGB, ...] = (
     (150, 38, 40), (30, 84, 62), (28, 56, 108), (206, 154, 40), (52, 44, 48), (238, 232, 216), (116, 54, 96),
     (40, 120, 136),
 )  # fmt: skip
+
+
+def tone(colour: RGB, factor: float) -> RGB:
+    """The colour made lighter or darker."""
+    r, g, b = (int(min(c * factor, 255)) for c in colour)
+    return r, g, b
