@@ -37,14 +37,9 @@ def place_model(path: str, device: str = "cpu", image_size: int | None = None) -
     Raises:
         UsageError: nothing there, or weights that do not fit; DataError: a broken file.
     """
-    from pipeline.common.errors import UsageError
-    from pipeline.config import ModelConfig
-    from pipeline.model.weights.convert import kind_of, read_model
+    import pipeline
 
-    kind = kind_of(path)
-    if kind == "backbone":
-        raise UsageError(f"{path}: a backbone alone; load a variant around it: backbone='{path}'")
-    return read_model(path, kind, ModelConfig(), image_size).to(device)
+    return pipeline.load_model(path, device, image_size).module
 
 
 def place_input(photo: str | Path | bytes, image_size: int = 224) -> Tensor:

@@ -18,15 +18,15 @@ import shutil
 import sys
 import textwrap
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn, TypeVar
 
 from pipeline.common.errors import UsageError, UserError
 from pipeline.common.text import shown
 from pipeline.config import RunConfig, from_dict
-from pipeline.config.setting import alternatives, is_section, nearest, present_name, shortened, type_hints
-from pipeline.config.words import from_text, read_config
+from pipeline.config.setting import alternatives, did_you_mean, present_name
+from pipeline.config.words import file_settings, from_text, put
 
 Config = TypeVar("Config")
 
@@ -79,9 +79,8 @@ def parse(
     hints = {o.name: o.hint for o in known} | ({"config": str} if config_file else {})
     values: dict[str, Any] = {}
     for name, text in _pairs(kind, words, hints):
-        given = _flat(kind, read_config(text), text, list(hints)) if name == "config" else [(name, text)]
-        for setting, value in given:
-            _put(values, setting, from_text(hints[setting], value))
+        for setting, value in file_settings(kind, text) if name == "config" else [(name, from_text(hints[name], text))]:
+            put(values, setting, value)
     built: Config = from_dict(kind, values)
     return built
 
@@ -234,7 +233,7 @@ def _pairs(kind: type, argv: Sequence[str], hints: Mapping[str, Any]) -> list[tu
         name, equals, value = word[2:].partition("=")
         name = present_name(kind, name.replace("-", "_"))
         if name not in hints:
-            raise UsageError(f"there is no option --{shown(name)}{_nearest(name, list(hints))}")
+            raise UsageError(f"there is no option --{shown(name)}{did_you_mean(name, list(hints))}")
         if not equals and words and not words[0].startswith("--"):
             value = words.pop(0)
         elif not equals and hints[name] is bool:
@@ -243,34 +242,3 @@ def _pairs(kind: type, argv: Sequence[str], hints: Mapping[str, Any]) -> list[tu
             raise UsageError(f"--{name} needs a value")
         pairs.append((name, value))
     return pairs
-
-
-def _flat(
-    kind: type, values: Mapping[str, Any], file: str, known: list[str], where: str = ""
-) -> Iterator[tuple[str, Any]]:
-    """(setting, words) of all settings in a file."""
-    hints = type_hints(kind)
-    for given, value in values.items():
-        name = present_name(kind, given)
-        if name not in hints:
-            told = where + given
-            raise UsageError(f"{file}: there is no setting {shown(told)}{_nearest(told, known)}")
-        if not is_section(hints[name]):
-            yield where + name, value
-        elif isinstance(value, dict):
-            yield from _flat(hints[name], value, file, known, f"{where}{name}.")
-        elif value != "":  # a section with nothing in it
-            raise UsageError(f"{file}: {where}{name} is a section with settings of its own, not {shortened(value)}")
-
-
-def _put(values: dict[str, Any], name: str, value: Any) -> None:
-    *sections, last = name.split(".")
-    for section in sections:
-        values = values.setdefault(section, {})
-    values[last] = value
-
-
-def _nearest(word: str, known: list[str]) -> str:
-    """` (did you mean 'train.lr'?)`, or nothing."""
-    near = nearest(word, known)
-    return f" (did you mean '{near}'?)" if near else ""

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.common.errors import UsageError
@@ -229,6 +231,21 @@ class RunConfig(Settings):
     """Evaluated after each epoch, best checkpoint chosen by R@5 of the first set and grouping; empty `sets`: none."""
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     """Where runs are recorded."""
+
+    @classmethod
+    def from_yaml(cls, path: str | Path, changes: Mapping[str, Any] | None = None) -> RunConfig:
+        """The config of a file, what it leaves out by default; then `changes`, such as {"train.epochs": 1}.
+
+        Raises:
+            UsageError: no such file, not YAML, an unknown setting, or a value outside its type or range.
+        """
+        from pipeline.config.words import file_settings, put
+
+        values: dict[str, Any] = {}
+        for name, value in [*file_settings(cls, str(path)), *(changes or {}).items()]:
+            put(values, name, value)
+        built: RunConfig = from_dict(cls, values)
+        return built
 
 
 def to_dict(config: Any) -> dict[str, Any]:

@@ -171,6 +171,12 @@ def nearest(word: str, known: list[str]) -> str | None:
     return near[0] if near and near[0] != word else None
 
 
+def did_you_mean(word: str, known: list[str]) -> str:
+    """` (did you mean 'train.lr'?)`, or nothing."""
+    near = nearest(word, known)
+    return f" (did you mean '{near}'?)" if near else ""
+
+
 def shortened(value: Any) -> str:
     """A value as one short line of printable characters, however large it is."""
     brief = reprlib.Repr()

@@ -10,6 +10,7 @@ import contextlib
 import re
 import types
 import typing
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,15 @@ import yaml
 
 from pipeline.common.errors import UsageError
 from pipeline.common.text import shown
-from pipeline.config.setting import alternatives, shortened
+from pipeline.config.setting import (
+    alternatives,
+    did_you_mean,
+    is_section,
+    leaves,
+    present_name,
+    shortened,
+    type_hints,
+)
 
 WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 LARGEST = 1 << 20  # bytes; the largest of ours has three thousand
@@ -56,6 +65,40 @@ def read_config(path: str) -> dict[str, Any]:
     if not isinstance(told, dict):
         raise UsageError(f"{path}: settings are written as `name: value`; this file holds {shortened(told)}")
     return told
+
+
+def file_settings(kind: type, path: str) -> list[tuple[str, Any]]:
+    """(dotted name, value) of all settings in a YAML file of config class `kind`, as `from_text` reads them.
+
+    Raises:
+        UsageError: as `read_config`; a setting that does not exist, with the nearest known name.
+    """
+    found: list[tuple[str, Any]] = []
+
+    def walk(inner: type, values: Mapping[str, Any], where: str) -> None:
+        hints = type_hints(inner)
+        for given, value in values.items():
+            name = present_name(inner, given)
+            if name not in hints:
+                told, known = where + given, [name for name, _ in leaves(kind)]
+                raise UsageError(f"{path}: there is no setting {shown(told)}{did_you_mean(told, known)}")
+            if not is_section(hints[name]):
+                found.append((where + name, from_text(hints[name], value)))
+            elif isinstance(value, dict):
+                walk(hints[name], value, f"{where}{name}.")
+            elif value != "":  # a section with nothing in it
+                raise UsageError(f"{path}: {where}{name} is a section with settings of its own, not {shortened(value)}")
+
+    walk(kind, read_config(path), "")
+    return found
+
+
+def put(values: dict[str, Any], name: str, value: Any) -> None:
+    """values["a"]["b"] = value for the name a.b; sections are made where they are missing."""
+    *sections, last = name.split(".")
+    for section in sections:
+        values = values.setdefault(section, {})
+    values[last] = value
 
 
 def read_texts(content: bytes | str, where: str) -> Any:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import subprocess
 import sys
 import time
+import tomllib
+import types
 from pathlib import Path
 
 import pytest
 
+from jobs import evaluate
 from jobs.cli import parse
+from jobs.evaluate import EvaluateJob
 from pipeline.common.errors import UsageError
 from pipeline.config import EvaluationConfig, RunConfig
 
 ROOT = Path(__file__).resolve().parents[2]
-JOBS = sorted(path.stem for path in (ROOT / "jobs").glob("*.py") if path.stem not in ("__init__", "cli"))
+JOBS = sorted(path.stem for path in (ROOT / "jobs").glob("*.py") if path.stem not in ("__init__", "cli", "console"))
 
 
 def test_yaml_then_overrides_in_order(tmp_path: Path) -> None:
@@ -67,6 +72,34 @@ def test_unknown_key_in_the_file(tmp_path: Path) -> None:
         parse(RunConfig, "", ["--config", str(file)])
 
 
+def test_help_has_groups_examples_as_lines_and_no_types_of_python(capsys: pytest.CaptureFixture[str]) -> None:
+    """The job's own options first, then the inherited, then the sections; both spellings are read."""
+    with pytest.raises(SystemExit):
+        parse(EvaluateJob, evaluate.__doc__ or "", ["--help"])
+    told = capsys.readouterr().out
+    assert "\n    python -m jobs.evaluate --checkpoint outputs/RUN --sets" in told
+    order = [
+        told.index(word) for word in ("options:", "--checkpoint TEXT", "Which sets are searched", "--sets TEXT,...")
+    ]
+    assert order == sorted(order)
+    assert "--split {train,val,test}" in told and "(default: test)" in told
+    assert not any(word in told for word in ("Literal", "Union", "None", "==SUPPRESS", "Optional"))
+    with pytest.raises(SystemExit):
+        parse(RunConfig, "", ["--help"])
+    told = capsys.readouterr().out
+    assert (
+        told.index("--name TEXT") < told.index("\ndata: ") < told.index("--data.order {city,") < told.index("\nmodel: ")
+    )
+    assert parse(EvaluationConfig, "", ["--group-size", "8"]) == parse(EvaluationConfig, "", ["--group_size", "8"])
+
+
+def test_a_wrong_option_is_told_before_wrong_data() -> None:
+    with pytest.raises(UsageError, match="no option --train"):
+        parse(RunConfig, "", ["--config", "nowhere.yaml", "--train.lrr", "1"])
+    with pytest.raises(UsageError, match="'outputs/run' stands without an option"):
+        parse(EvaluationConfig, "", ["--split", "val", "outputs/run"])
+
+
 @pytest.mark.parametrize("job", JOBS)
 def test_help_names_every_field_and_loads_nothing_heavy(job: str) -> None:
     """Half a second on an idle machine; what is asserted is what makes it so: none of the heavy imports."""
@@ -93,3 +126,20 @@ def test_user_errors_have_exit_codes_and_no_traceback(tmp_path: Path) -> None:
         assert done.returncode in code, done.stderr
         assert "Traceback" not in done.stderr
         assert done.stderr.strip().splitlines()[-1].startswith(arguments[0] + ":")
+
+
+def test_every_job_has_its_console_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """As pip makes them of pyproject.toml; started as `vpr-train --help` and with an option that does not exist."""
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    assert scripts == {f"vpr-{job}": f"jobs.console:{job}" for job in JOBS}
+    command = importlib.metadata.EntryPoint("vpr-train", scripts["vpr-train"], "console_scripts").load()
+    monkeypatch.setitem(sys.modules, "__main__", types.ModuleType("__main__"))
+    for words, code, wanted in ((["--help"], 0, "usage: vpr-train"), (["--lr", "1"], 2, "did you mean 'train.lr'")):
+        monkeypatch.setattr("sys.argv", ["/bin/vpr-train", *words])
+        with pytest.raises(SystemExit) as ended:
+            command()
+        told = capsys.readouterr()
+        assert ended.value.code == code and wanted in told.out + told.err
+    assert told.err.startswith("vpr-train: ")
+    with pytest.raises(AttributeError, match="no job 'trian'"):
+        importlib.metadata.EntryPoint("vpr-trian", "jobs.console:trian", "console_scripts").load()
