@@ -45,13 +45,27 @@ class DataConfig(Settings):
 
     shards: tuple[str, ...] | str = setting("data/shards", changes="numbers", resume="free")
     """Folder, or any fsspec URL, of a shard set made by jobs.prepare; or a list, `[a, b]`: one training over all."""
-    shard_weights: tuple[float, ...] = setting((), changes="numbers", above=0, may_be_empty=True)
+    shard_weights: tuple[float, ...] = setting((), changes="numbers", above=0, at_most=100, may_be_empty=True)
     """How often a place of each set comes in an epoch, above 0: 0.5 half of the places, 2 each twice (never in one
     batch); empty: 1 for each set."""
     places_per_batch: int = setting(72, changes="numbers", at_least=1)
     """Places in the global batch, over all ranks; four images each (paper: 72, so 288 images)."""
-    order: Literal["city", "mixed", "blocked"] = setting("city", changes="numbers")
-    """Order of places: in-city batches (as published in effect), mixed over cities, or within windows of shards."""
+    order: Literal["city", "mixed", "blocked", "mined"] = setting("city", changes="numbers")
+    """Order of places: in-city batches (as published in effect), mixed over cities, within windows of shards, or
+    in-city batches of places that look alike to the model (mined; the first epoch is as city)."""
+    mine_from: str = setting("single", changes="numbers")
+    """mined: what tells that places look alike. single: descriptors of each image alone, by the model being trained;
+    permuted: the same, shuffled among the places of each city, a control without hardness; or a file of jobs.mine."""
+    mine_every: int = setting(1, changes="numbers", at_least=1)
+    """mined: epochs between two minings, the first before the second epoch. Not used with a file."""
+    clique: int = setting(6, changes="numbers", at_least=2)
+    """mined: places that are grouped because they look alike; a batch is made of such groups."""
+    mine_neighbours: int = setting(64, changes="numbers", at_least=1, at_most=1024)
+    """mined: most similar places of the same city that a group is drawn from."""
+    mine_radius: float = setting(25.0, changes="numbers", at_least=0)
+    """mined: no two places of a group lie closer than this, in metres; 0: positions are not used."""
+    mine_temperature: float = setting(0.05, changes="numbers", at_least=0, at_most=1000)
+    """mined: randomness of the draw, in units of cosine similarity; 0 takes the most similar ones."""
     window_shards: int = setting(8, changes="numbers", at_least=1)
     """Shards read together by order=blocked."""
     image_size: int = setting(224, changes="numbers", at_least=1, at_most=8192)

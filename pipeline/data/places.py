@@ -172,31 +172,30 @@ class Places(Dataset[Batch | Failure]):
 
 
 class PlaceLoader:
-    """The rest of an epoch, as this rank's batches in the order of the plan. Iterate once; `len` is what is to come."""
+    """The rest of a plan, as this rank's batches in their order. Iterate once; `len` is what is to come."""
 
     def __init__(
         self,
         index: ShardIndex,
         data: DataConfig,
+        planned: EpochPlan,
         seed: int,
-        epoch: int,
         start_step: int,
         rank: int,
         world_size: int,
-        mined: Mined | None = None,
     ) -> None:
         check(data.rand_ops, data.rand_magnitude)
-        if data.places_per_batch % world_size:
+        self.plan = planned
+        steps, places = planned.batches.shape
+        if places % world_size:
             raise UsageError(
-                f"data.places_per_batch is {data.places_per_batch}, not a multiple of the {world_size} processes: "
-                f"ranks hold equal parts of a batch"
+                f"data.places_per_batch is {places}, not a multiple of the {world_size} processes: ranks hold equal "
+                f"parts of a batch"
             )
-        self.plan: EpochPlan = plan(index, seed, epoch, data.places_per_batch, data.order, data.window_shards, mined)
-        steps = len(self.plan.batches)
         if not 0 <= start_step <= steps:
-            raise UsageError(f"epoch {epoch} has {steps} steps; it cannot start at step {start_step}")
+            raise UsageError(f"the epoch has {steps} steps; it cannot start at step {start_step}")
         self.start_step, self.workers = start_step, data.workers
-        self.places = data.places_per_batch // world_size
+        self.places = places // world_size
         mine = self.plan.batches[:, rank * self.places : (rank + 1) * self.places]
         self.cache = cache_of(index, Path(data.cache), int(data.cache_gb * 1e9))
         turns = np.repeat(self.plan.turns, self.places)
@@ -290,4 +289,5 @@ def build_loader(
         UsageError: a batch that ranks cannot share equally, or too few places or too little cache for the settings.
         DataError: while iterating, a shard or member that cannot be read or decoded.
     """
-    return PlaceLoader(index, data, seed, epoch, start_step, rank, world_size, mined)
+    planned = plan(index, seed, epoch, data.places_per_batch, data.order, data.window_shards, mined)
+    return PlaceLoader(index, data, planned, seed, start_step, rank, world_size)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pipeline.common.errors import DataError, UsageError
 from pipeline.data.cliques import Mined, cliques
 from pipeline.data.keyed import Rows, random
-from pipeline.data.shard_sets import ShardSets
+from pipeline.data.shard_sets import ShardSets, rows_of_round
 
 if TYPE_CHECKING:
     from shards.index import ShardIndex
@@ -101,8 +101,7 @@ def _rows(index: ShardIndex, turn: int, seed: int) -> Rows:
     """The rows of a pass, by place, whatever order the shards were written in."""
     places = _column(index, "place")
     if not isinstance(index, ShardSets):
-        rows = np.flatnonzero(_column(index, "round") == turn % max(index.rounds, 1)).astype(np.int64)
-        rows = rows[np.argsort(places[rows], kind="stable")]
+        rows = rows_of_round(index, turn)
         if len(np.unique(places[rows])) != len(rows):
             raise DataError(f"{index.root}: a round of the index holds a place twice; prepare the shards again")
         return rows

@@ -28,12 +28,14 @@ def points(degrees: NDArray[np.float64]) -> NDArray[np.float64]:
     return EARTH * np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
 
 
-def place_points(index: ShardIndex, setting: str) -> tuple[NDArray[np.float64], int]:
-    """Points [P, 3] of all places in metres, by place number, and how many are unknown (NaN).
+def place_points(index: ShardIndex, setting: str, needed: bool = True) -> tuple[NDArray[np.float64], int]:
+    """Points [P, 3] of all places in metres, by place number, and how many are unknown (NaN: all, where not `needed`).
 
     Raises:
         DataError: no place has a position, so `setting` could do nothing; or a set made without positions.
     """
+    if not needed:
+        return np.full((index.places, 3), np.nan), index.places
     found = points(index.positions())
     unknown = int(np.isnan(found).any(1).sum())
     if unknown == len(found):

@@ -23,6 +23,7 @@ import pyarrow.compute as pc
 from pipeline.common.errors import UsageError
 from pipeline.config import DataConfig
 from pipeline.data.cache import ShardCache
+from pipeline.data.keyed import Rows
 from shards.index import SCHEMA, ShardIndex, read_index
 
 PREFIXED = ("sample", "city", "shard")
@@ -65,6 +66,20 @@ class ShardSets(ShardIndex):
         return np.concatenate([part.positions() for part in self.sets])
 
 
+def rows_of_round(index: ShardIndex, turn: int) -> Rows:
+    """The rows of every place [P] in round `turn` mod its set's rounds, by place number."""
+    sets = index.sets if isinstance(index, ShardSets) else (index,)
+    rounds = np.repeat([part.rounds for part in sets], [part.table.num_rows for part in sets])
+    rows = np.flatnonzero(index.table["round"].to_numpy() == turn % np.maximum(rounds, 1))
+    return np.asarray(rows[np.argsort(index.table["place"].to_numpy()[rows], kind="stable")], np.int64)
+
+
+def cities_of(index: ShardIndex) -> Rows:
+    """A number for the city of each place [P], by place number."""
+    column = index.table["city"].take(rows_of_round(index, 0)).combine_chunks().dictionary_encode()
+    return np.asarray(column.indices.to_numpy(), np.int64)
+
+
 def open_shards(data: DataConfig) -> ShardIndex:
     """The shard set, or the sets, of a run.
 
@@ -80,12 +95,6 @@ def open_shards(data: DataConfig) -> ShardIndex:
             f"data.shard_weights has {len(data.shard_weights)} numbers for {len(roots)} sets in data.shards"
         )
     given = data.shard_weights or (1,) * len(roots)
-    for root, weight in zip(roots, given, strict=True):
-        if not 0 < weight <= 100:
-            raise UsageError(
-                f"data.shard_weights: {weight:g} for {root}; weights are above 0 and at most 100 (to leave a set out, "
-                f"take it out of data.shards)"
-            )
     weights = tuple(Fraction(str(weight)) for weight in given)
     sets = tuple(read_index(root) for root in roots)
     if len(sets) == 1 and weights == (1,):

@@ -44,6 +44,7 @@ class RunState:
         validated: the newest validation, metric name -> value, and the step it was made at (None: not yet).
         start: the same before the first step, {} where it was not measured.
         scaler: loss scale of fp16, empty otherwise.
+        mined: the descriptors that the epoch is planned from: file, sha256, epoch they were made at; {}: none yet.
     """
 
     step: int = 0
@@ -59,6 +60,7 @@ class RunState:
     validated_step: int | None = None
     start: dict[str, float] = dataclasses.field(default_factory=dict)
     scaler: dict[str, float] = dataclasses.field(default_factory=dict)
+    mined: dict[str, str | int] = dataclasses.field(default_factory=dict)
 
 
 def folder(run: Path, step: int) -> Path:

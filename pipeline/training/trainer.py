@@ -21,6 +21,7 @@ from torch import Tensor
 
 from pipeline.common.errors import Diverged, Preempted, UsageError
 from pipeline.config import RunConfig, to_dict
+from pipeline.data.cliques import Mined
 from pipeline.data.images import normalise
 from pipeline.data.places import Batch, build_loader
 from pipeline.data.plan import plan
@@ -39,6 +40,7 @@ from pipeline.training.initialise import initialise
 from pipeline.training.launch import stop_signals
 from pipeline.training.loss import MultiSimilarityLoss
 from pipeline.training.meter import Meter
+from pipeline.training.mining import Mining
 from pipeline.training.schedule import build_optimizer, learning_rate
 from pipeline.training.tracking import Tracker
 from pipeline.training.validation import Validation
@@ -99,6 +101,7 @@ class Trainer:
         )
         self.engine.load(optimizer, self.state.scaler)
         self.loss = build_loss(config, self.index).to(accelerator.device)
+        self.mining = Mining(config, self.index, self.run, self.origin) if config.data.order == "mined" else None
         self.validation = Validation(config, accelerator.device) if config.validate.sets else None
 
     def fit(self) -> Outcome:
@@ -112,6 +115,9 @@ class Trainer:
         if self._ended():
             return Outcome(self.run, self.state, "already finished")
         self._open()
+        if self.mining is not None:
+            self.mining.adopt(self.state)
+            self.mining.tell()
         status = "FAILED"
         try:
             with stop_signals() as self.stops:
@@ -144,7 +150,9 @@ class Trainer:
     def _train_epoch(self) -> None:
         """The steps that are left of the current epoch."""
         state, config = self.state, self.config
-        loader = build_loader(self.index, config.data, config.seed, state.epoch, state.cursor, rank(), world_size())
+        loader = build_loader(
+            self.index, config.data, config.seed, state.epoch, state.cursor, rank(), world_size(), self._mined()
+        )
         self.engine.model.train()
         meter = Meter(config.data.places_per_batch * 4, self.total_steps, state, enabled=self.main)
         with meter:
@@ -157,6 +165,20 @@ class Trainer:
                     break  # train.steps falls inside the epoch
                 if state.step % config.train.save_every == 0 and state.cursor < self.steps_per_epoch:
                     self._save()
+
+    def _mined(self) -> Mined | None:
+        """What a mined epoch is planned from; made now, by the model as it is, where it is due."""
+        if self.mining is None:
+            return None
+        if self.mining.due(self.state):
+            with self.engine.plain() as model, uncompiled(self.config.train.compile):
+                self.mining.make(self.state, model, self.accelerator, self._stop_unsaved)
+        return self.mining.mined(self.state)
+
+    def _stop_unsaved(self) -> None:
+        """Leaves where nothing has happened since the last checkpoint."""
+        if self._asked_to_stop():
+            raise self._preempted()
 
     def _step(self, batch: Batch, meter: Meter) -> None:
         state, config = self.state, self.config
@@ -245,6 +267,7 @@ class Trainer:
     def _resume(self, model: PlaceModel) -> tuple[RunState, dict[str, Tensor]]:
         """Where to continue, the weights put into the model; or a new run's state."""
         path = checkpoint.find(self.run, self.config.train.resume)
+        self.origin = self.run if path is None else path.parent.parent
         if path is None:
             return RunState(index=self.index.digest), {}
         if rank() == 0:

@@ -1,0 +1,116 @@
+"""Real runs in mined order: killed while mining on 2 ranks, resumed on 2 and on 1, and a changed or missing file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from launched import Launched
+from tiny import prepare, run_settings
+
+from pipeline.data.cliques import CliqueRule, mine
+from pipeline.data.place_descriptors import read_descriptors
+from pipeline.data.plan import plan
+from pipeline.data.positions import points
+from pipeline.data.shard_sets import cities_of
+from shards.index import read_index
+
+MINED = {"order": "mined", "clique": 2, "mine_neighbours": 8, "mine_radius": 150.0, "mine_temperature": 0.01}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return prepare(tmp_path_factory.mktemp("mined"))
+
+
+def config(root: Path, name: str, **data: Any) -> Path:
+    settings = {**run_settings(root), "name": name, "loss": {"ignore_within": 150.0}}
+    settings["data"] |= MINED | data
+    settings["train"] |= {"epochs": 3}
+    settings["validate"]["sets"] = []
+    path = root / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(settings))
+    return path
+
+
+def start(path: Path, world: int) -> Launched:
+    return Launched("ddp", world, "jobs.train", ["--config", str(path)], path.with_suffix(".log"))
+
+
+def run(path: Path, world: int, code: int = 0) -> str:
+    job = start(path, world)
+    assert job.wait() == [code] * world, job.ranks[0].text()[-3000:]
+    return job.ranks[0].text()
+
+
+def samples(root: Path, name: str) -> dict[int, list[str]]:
+    """Step -> the samples of the global batch, ranks joined in order."""
+    steps: dict[int, list[str]] = {}
+    for path in sorted((root / "outputs" / name).glob("samples.rank*.jsonl")):
+        for line in path.read_text().splitlines():
+            entry = json.loads(line)
+            steps.setdefault(entry["step"], []).extend(entry["samples"])
+    return steps
+
+
+def states(root: Path, name: str) -> Iterator[dict[str, Any]]:
+    for path in sorted((root / "outputs" / name / "checkpoints").glob("step-*/state.json")):
+        yield json.loads(path.read_text())["state"]
+
+
+def test_mined_runs_are_exact_given_their_files(root: Path) -> None:
+    run(config(root, "whole"), 2)
+    *_, last = states(root, "whole")
+    assert last["mined"]["epoch"] == 2 and last["step"] == 18
+    folder = root / "outputs/whole/mined"
+    found = {path.name[:10]: path for path in folder.iterdir()}
+    assert found["epoch-0002"].name == last["mined"]["file"]
+
+    # the third epoch's batches are the plan of that file, and hold places that look alike
+    index = read_index(str(root / "shards"))
+    descriptors = read_descriptors(found["epoch-0002"], index.digest, 24, last["mined"]["sha256"])
+    assert (descriptors.kind, descriptors.round, descriptors.values.shape) == ("single", 2, (24, 24))
+    mined = mine(descriptors.values, cities_of(index), points(index.positions()), CliqueRule(2, 8, 150.0, 0.01))
+    batches = plan(index, 0, 2, 4, "mined", mined=mined).batches
+    whole = samples(root, "whole")
+    assert [whole[step] for step in range(13, 19)] == [index.table.take(rows)["sample"].to_pylist() for rows in batches]
+    assert [whole[step] for step in range(1, 7)] == [
+        index.table.take(rows)["sample"].to_pylist() for rows in plan(index, 0, 0, 4, "city").batches
+    ]
+    assert (batches != plan(index, 0, 2, 4, "city").batches).any()
+
+    # killed while it mines before the second epoch: mined again from the checkpoint, to the bit
+    path = config(root, "killed")
+    out = root / "outputs/killed"
+    start(path, 2).kill_when(lambda: (out / "mined").is_dir())
+    assert [state["step"] for state in states(root, "killed")][-1] == 6
+    log = out / "samples.rank1.jsonl"
+    start(path, 2).kill_when(lambda: '"step": 15,' in log.read_text())
+    *_, state = states(root, "killed")
+    assert state["mined"] == last["mined"]  # the same file, so the same weights at both minings
+    assert len(list((out / "mined").iterdir())) <= 2  # what no checkpoint needs is gone
+
+    # changed, then missing: refused; put back, one process goes on with what two began
+    file = out / "mined" / state["mined"]["file"]
+    true = file.read_bytes()
+    file.write_bytes(true[:-1] + bytes([true[-1] ^ 1]))
+    assert "has changed" in run(path, 1, code=3)
+    file.unlink()
+    assert "are missing" in run(path, 1, code=3)
+    file.write_bytes(true)
+    run(path, 1)
+    assert samples(root, "killed") == whole
+
+    # branched off under another name: the file is copied, and the same batches come
+    branch = config(root, "branch")
+    checkpoint = next(s for s in (out / "checkpoints").glob("step-*") if s.name.endswith("16"))
+    job = Launched(
+        "ddp", 1, "jobs.train", ["--config", str(branch), "--train.resume", str(checkpoint)], branch.with_suffix(".log")
+    )
+    assert job.wait() == [0], job.ranks[0].text()[-3000:]
+    assert (root / "outputs/branch/mined" / file.name).read_bytes() == true
+    assert samples(root, "branch") == {step: whole[step] for step in (17, 18)}
