@@ -35,6 +35,8 @@ class EpochPlan:
     """[steps, places_per_batch] row numbers of the index table, in the order they are trained on."""
     left_over: int
     """Places that fill no batch in a pass of this epoch, always fewer than places_per_batch."""
+    in_cliques: int
+    """Places of the epoch that are in a clique; 0 where nothing is mined."""
     turns: Rows
     """[steps] the turn of each batch, epoch x passes + pass: with the sample, the key of its images' randomness."""
 
@@ -82,7 +84,7 @@ def plan(
             f"and the epoch ({epoch}) at least 0"
         )
     passes = index.passes if isinstance(index, ShardSets) else 1
-    parts, left = [], 0
+    parts, left, members = [], 0, 0
     for turn in range(epoch * passes, (epoch + 1) * passes):
         rows = _rows(index, turn, seed)
         if len(rows) < places_per_batch:
@@ -92,9 +94,13 @@ def plan(
             )
         left = len(rows) % places_per_batch
         rows = rows[_kept(len(rows), left, seed, turn)]
-        parts.append(_ordered(index, rows, seed, turn, places_per_batch, order, window_shards, mined))
+        keys = random(len(rows), "places", seed, turn)
+        if order == "mined" and mined is not None:
+            keys, found = _cliques_first(index, rows, keys, seed, turn, mined)
+            members += found
+        parts.append(_ordered(index, rows, keys, seed, turn, places_per_batch, order, window_shards))
     turns = np.repeat(np.arange(epoch * passes, (epoch + 1) * passes), len(parts[0]))
-    return EpochPlan(np.concatenate(parts), left, turns)
+    return EpochPlan(np.concatenate(parts), left, members, turns)
 
 
 def _rows(index: ShardIndex, turn: int, seed: int) -> Rows:
@@ -124,25 +130,28 @@ def _rows(index: ShardIndex, turn: int, seed: int) -> Rows:
 
 
 def _ordered(
-    index: ShardIndex, rows: Rows, seed: int, turn: int, size: int, order: Order, window_shards: int,
-    mined: Mined | None,
-) -> Rows:  # fmt: skip
-    """Batches [steps, size] of the rows of a pass."""
-    keys = random(len(rows), "places", seed, turn)
+    index: ShardIndex, rows: Rows, keys: NDArray[np.uint64], seed: int, turn: int, size: int, order: Order, window: int
+) -> Rows:
+    """Batches [steps, size] of the rows of a pass; `keys` shuffle them."""
     if order == "mixed":
         return rows[np.argsort(keys, kind="stable")].reshape(-1, size)
     if order == "blocked":
-        window = _shuffled_groups(_column(index, "shard")[rows], "shards", seed, turn) // window_shards
-        return rows[np.lexsort((keys, window))].reshape(-1, size)
-    if mined is not None and order == "mined":
-        places = _column(index, "place")[rows]
-        made = cliques(mined, places, keys, seed, turn).reshape(-1)
-        first = np.full(int(places.max()) + 1, len(made))
-        first[made] = np.arange(len(made))
-        rank = np.lexsort((keys, first[places]))  # clique after clique, then the others by their keys
-        keys = np.empty(len(rows), np.uint64)
-        keys[rank] = np.arange(len(rows), dtype=np.uint64)
+        windows = _shuffled_groups(_column(index, "shard")[rows], "shards", seed, turn) // window
+        return rows[np.lexsort((keys, windows))].reshape(-1, size)
     return _shuffled(_in_cities(index, rows, keys, size, seed, turn), seed, turn)
+
+
+def _cliques_first(
+    index: ShardIndex, rows: Rows, keys: NDArray[np.uint64], seed: int, turn: int, mined: Mined
+) -> tuple[NDArray[np.uint64], int]:
+    """Keys that put the rows clique after clique, then the others by their own keys; and the number of members."""
+    places = _column(index, "place")[rows]
+    made = cliques(mined, places, keys, seed, turn).reshape(-1)
+    first = np.full(index.places, len(made))
+    first[made] = np.arange(len(made))
+    ranked = np.empty(len(rows), np.uint64)
+    ranked[np.lexsort((keys, first[places]))] = np.arange(len(rows), dtype=np.uint64)
+    return ranked, len(made)
 
 
 def _in_cities(index: ShardIndex, rows: Rows, keys: NDArray[np.uint64], size: int, seed: int, epoch: int) -> Rows:

@@ -84,18 +84,15 @@ def open_shards(data: DataConfig) -> ShardIndex:
     """The shard set, or the sets, of a run.
 
     Raises:
-        UsageError: no set, a set twice, or weights that do not fit the sets.
+        UsageError: a set twice, or weights that do not fit the sets.
         DataError: as `read_index`, for the first set that cannot be opened.
     """
     roots = (data.shards,) if isinstance(data.shards, str) else data.shards
-    if not roots:
-        raise UsageError("data.shards names no shard set")
     if data.shard_weights and len(data.shard_weights) != len(roots):
         raise UsageError(
             f"data.shard_weights has {len(data.shard_weights)} numbers for {len(roots)} sets in data.shards"
         )
-    given = data.shard_weights or (1,) * len(roots)
-    weights = tuple(Fraction(str(weight)) for weight in given)
+    weights = tuple(Fraction(str(weight)) for weight in data.shard_weights or (1,) * len(roots))
     sets = tuple(read_index(root) for root in roots)
     if len(sets) == 1 and weights == (1,):
         return sets[0]

@@ -6,6 +6,8 @@ Invariant: nothing is written. Counts are exact; activation memory is measured o
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 
 from pipeline.common.text import Table
@@ -15,6 +17,7 @@ from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import ShardSets, open_shards
 from pipeline.distributed import world_size
 from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
+from pipeline.training.mining import Mining
 from shards.index import ShardIndex
 
 # whole copies of the trainable parameters that the optimiser keeps
@@ -75,6 +78,7 @@ def _plan_rows(config: RunConfig, index: ShardIndex) -> list[tuple[str, str]]:
         ),
         ("global batch", f"{data.places_per_batch} places x 4 = {images} images, order {data.order}"),
         ("processes", f"{w}, {images // w} images each"),
+        *([("mining", Mining(config, index, Path(config.output)).told())] if data.order == "mined" else []),
         ("epoch", f"{steps:,} steps; {first.left_over:,} places wait for another epoch"),
         ("run", f"{limited:,} steps in {config.train.epochs} epochs, {limited * images:,} images"),
     ]

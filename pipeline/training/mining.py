@@ -120,6 +120,15 @@ class Mining:
 
         on_rank_0(copy, what=f"copying mined descriptors to {self.folder}")
 
+    def told(self) -> str:
+        """What will be mined, in one line."""
+        data = self.data
+        drawn = f"groups of {data.clique} places, drawn from {data.mine_neighbours} neighbours"
+        if data.mine_from not in MODEL:
+            return f"{drawn} by {data.mine_from}"
+        every = "each epoch" if data.mine_every == 1 else f"every {data.mine_every} epochs"
+        return f"{drawn}; from the second epoch, {every}: {4 * self.index.places:,} images are described"
+
     def tell(self) -> None:
         """Says once, on rank 0, how many places have no position."""
         if self.unknown and self.data.mine_radius and rank() == 0:

@@ -153,6 +153,11 @@ class Trainer:
         loader = build_loader(
             self.index, config.data, config.seed, state.epoch, state.cursor, rank(), world_size(), self._mined()
         )
+        if loader.plan.in_cliques and self.main:
+            share = 100 * loader.plan.in_cliques / loader.plan.batches.size
+            print(
+                f"epoch {state.epoch + 1}: {share:.0f} % of the places are in mined groups", file=sys.stderr, flush=True
+            )
         self.engine.model.train()
         meter = Meter(config.data.places_per_batch * 4, self.total_steps, state, enabled=self.main)
         with meter:

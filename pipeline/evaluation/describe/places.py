@@ -68,7 +68,7 @@ def describe_places(
     w, total = distributed.world_size(), len(rows)
     steps = -(-total // (PLACES * w))
     filled = np.append(rows, np.repeat(rows[-1:], steps * PLACES * w - total))
-    planned = EpochPlan(filled.reshape(steps, PLACES * w), 0, np.zeros(steps, np.int64))
+    planned = EpochPlan(filled.reshape(steps, PLACES * w), 0, 0, np.zeros(steps, np.int64))
     unaltered = dataclasses.replace(data, augment="off", order="city")
     loader = iter(PlaceLoader(index, unaltered, planned, 0, 0, distributed.rank(), w))
     first = distributed.rank() == 0

@@ -64,6 +64,7 @@ def test_the_mined_plan(
     assert (plan(index, seed, epoch, batch, "mined", mined=mined).batches == planned.batches).all()
     assert (plan(index, seed, epoch, batch, "mined").batches == plain.batches).all()  # before the first mining
 
+    members = 0
     for turn in np.unique(planned.turns):  # the same places as in order city, each once a pass
         rows = planned.batches[planned.turns == turn]
         assert sorted(rows.reshape(-1)) == sorted(plain.batches[plain.turns == turn].reshape(-1))
@@ -75,12 +76,14 @@ def test_the_mined_plan(
 
         made = cliques(mined, np.sort(places), random(len(places), "places", seed, turn), seed, int(turn))
         assert made.shape[1] == rule.clique and len(set(made.reshape(-1).tolist())) == made.size
+        members += made.size
         city = cities_of(index)
         for clique in made:
             assert len(set(city[clique].tolist())) == 1 and set(clique) <= set(places)
             assert set(clique[1:]) <= set(mined.near[clique[0]])  # all are neighbours of the first
             apart = np.linalg.norm(mined.points[clique][:, None] - mined.points[clique][None], axis=2)
             assert not (apart + np.eye(rule.clique) * 1e9 < rule.radius).any()
+    assert planned.in_cliques == members and plain.in_cliques == 0
 
 
 @settings(max_examples=20, deadline=None)

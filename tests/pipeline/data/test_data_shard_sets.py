@@ -77,7 +77,7 @@ def test_one_set_in_a_list_is_that_set(tmp_path: Path, make_set: Make, monkeypat
         ((a, b), (1.0,), "1 numbers for 2 sets"),
         ((a, b), (1.0, 0.0), "shard_weights must be"),
         ((a, b), (1.0, float("nan")), "shard_weights must be"),
-        ((), (), "names no shard set"),
+        ((), (), "shards must be"),
     ):
         with pytest.raises(UsageError, match=message):
             open_shards(DataConfig(shards=shards, shard_weights=weights))

@@ -11,12 +11,16 @@ import pytest
 import yaml
 from launched import Launched
 from tiny import prepare, run_settings
+from tiny_checkpoint import save_tiny
 
+from pipeline.common.errors import DataError, UsageError
+from pipeline.config import DataConfig
 from pipeline.data.cliques import CliqueRule, mine
 from pipeline.data.place_descriptors import read_descriptors
 from pipeline.data.plan import plan
 from pipeline.data.positions import points
 from pipeline.data.shard_sets import cities_of
+from pipeline.training.mining import check_rule
 from shards.index import read_index
 
 MINED = {"order": "mined", "clique": 2, "mine_neighbours": 8, "mine_radius": 150.0, "mine_temperature": 0.01}
@@ -114,3 +118,45 @@ def test_mined_runs_are_exact_given_their_files(root: Path) -> None:
     assert job.wait() == [0], job.ranks[0].text()[-3000:]
     assert (root / "outputs/branch/mined" / file.name).read_bytes() == true
     assert samples(root, "branch") == {step: whole[step] for step in (17, 18)}
+
+
+def test_a_file_of_jobs_mine_plans_every_epoch(root: Path) -> None:
+    """2 processes write the very file that 1 writes; a training plans its first epoch from it; permuted is another."""
+    model = save_tiny(root / "model", 1)
+    shards = str(root / "shards")
+    digests = {}
+    for name, world, *options in (("one", 1), ("two", 2), ("mixed", 1, "--kind", "permuted")):
+        out = root / f"{name}.safetensors"
+        words = ["--checkpoint", str(model), "--shards", shards, "--out", str(out), "--workers", "0", *options]
+        printed = Launched("ddp", world, "jobs.mine", words, root / f"{name}.log").done()
+        digests[name] = printed.split("sha256 ")[1].split()[0]
+    assert (root / "one.safetensors").read_bytes() == (root / "two.safetensors").read_bytes()
+    index = read_index(shards)
+    one, mixed = (read_descriptors(root / f"{n}.safetensors", index.digest, 24, digests[n]) for n in ("one", "mixed"))
+    cities = cities_of(index)
+    for city in (0, 1):  # the same descriptors, of other places of the city
+        rows = [sorted(map(bytes, found.values[cities == city])) for found in (one, mixed)]
+        assert rows[0] == rows[1]
+    assert (one.values != mixed.values).any()
+
+    path = config(root, "given", mine_from=str(root / "one.safetensors"))
+    job = Launched("ddp", 1, "jobs.train", ["--config", str(path), "--train.steps", "6"], root / "given.log")
+    assert job.wait() == [0], job.ranks[0].text()[-3000:]
+    mined = mine(one.values, cities, points(index.positions()), CliqueRule(2, 8, 150.0, 0.01))
+    batches = plan(index, 0, 0, 4, "mined", mined=mined).batches
+    found = samples(root, "given")
+    assert [found[step] for step in range(1, 7)] == [index.table.take(rows)["sample"].to_pylist() for rows in batches]
+    assert all(state["mined"]["sha256"] == digests["one"] for state in states(root, "given"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"mine_from": "nothing"}, "nothing is neither single nor permuted nor a file"),
+        ({"clique": 5}, "clique is 5: .* cannot be larger than a batch"),
+        ({"mine_neighbours": 2}, r"mine_neighbours \(2\) is fewer than a group needs"),
+    ],
+)
+def test_settings_that_make_no_group_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises((UsageError, DataError), match=message):
+        check_rule(DataConfig(places_per_batch=4, **{"clique": 4, **settings}))
