@@ -23,7 +23,7 @@ SCHEMA = pa.schema(
         ("city", pa.string()),
         ("place_id", pa.string()),  # unique within its city
         ("path", pa.string()),  # from the source's root, with /
-        ("size", pa.int64()),  # bytes; -1: no such file
+        ("size", pa.int64()),  # bytes; -1: no such file, -2: it may not be read
         ("lat", pa.float64()),  # degrees; null where unknown, as the rest
         ("lon", pa.float64()),
         ("year", pa.int32()),
@@ -57,7 +57,8 @@ class Catalogue:
     left_out: tuple[LeftOut, ...]
     duplicates: int  # rows that name a photo already named
     unlisted: int  # image files that no row or place names
-    digest: str  # sha256 of all that is said here, without the root
+    digest: str  # sha256 of all that is said above, without the root
+    remarks: tuple[str, ...] = ()  # what a person should know of how it was read
 
     @property
     def images(self) -> int:
@@ -65,7 +66,14 @@ class Catalogue:
         return self.table.num_rows + len(self.left_out)
 
 
-def build(kind: str, root: Path, table: pa.Table, left_out: Sequence[LeftOut] = (), unlisted: int = 0) -> Catalogue:
+def build(
+    kind: str,
+    root: Path,
+    table: pa.Table,
+    left_out: Sequence[LeftOut] = (),
+    unlisted: int = 0,
+    remarks: Sequence[str] = (),
+) -> Catalogue:
     """Sorts, removes duplicates, sets aside missing and empty files.
 
     Args:
@@ -74,6 +82,7 @@ def build(kind: str, root: Path, table: pa.Table, left_out: Sequence[LeftOut] = 
         table: columns of `SCHEMA`, any order of rows.
         left_out: photos already refused by the reader (no place can be told).
         unlisted: image files that nothing names.
+        remarks: what a person should know of how it was read.
 
     Raises:
         DataError: there is no photo at all.
@@ -88,13 +97,12 @@ def build(kind: str, root: Path, table: pa.Table, left_out: Sequence[LeftOut] = 
     listed = unique.select(["city", "place_id"]).take(pa.array(starts)).append_column("images", pa.array(counts))
     out = list(left_out)
     for row in unique.filter(pc.less_equal(unique["size"], 0)).to_pylist():
-        reason = "missing" if row["size"] < 0 else "empty file (0 bytes)"
+        reason = {0: "empty file (0 bytes)", -1: "missing"}.get(row["size"], "cannot be read: no permission")
         out.append(LeftOut(row["path"], row["city"], row["place_id"], reason))
     present = unique.filter(pc.greater(unique["size"], 0)).combine_chunks()
     digest = _digest(kind, present, out)
-    return Catalogue(
-        kind, root, present, listed, tuple(sorted(out)), table.num_rows - unique.num_rows, unlisted, digest
-    )
+    again = table.num_rows - unique.num_rows
+    return Catalogue(kind, root, present, listed, tuple(sorted(out)), again, unlisted, digest, tuple(remarks))
 
 
 def runs(table: pa.Table) -> tuple[np.ndarray, np.ndarray]:
