@@ -21,7 +21,7 @@ class PrepareConfig:
     """What to prepare, or to verify."""
 
     source: str | None = None
-    """Folder of GSV-Cities (Images/ and Dataframes/), or of one's own places."""
+    """Folder of GSV-Cities (Images/ and Dataframes/), Mapillary SLS (train_val/), @utm names, or one's own places."""
     out: str | None = None
     """Folder of the shard set; new, empty, or of the same set begun earlier."""
     rounds: int = 4
@@ -36,14 +36,14 @@ class PrepareConfig:
     """Reduce larger photos to this shorter side in pixels (JPEG quality 95); 0 copies the bytes."""
     check: Literal["decode", "header", "none"] = "decode"
     """How each JPEG is checked: decoded to its end, header and end marker only, or not at all."""
-    kind: Literal["auto", "gsv_cities", "folders", "utm"] = "auto"
-    """Layout of the source: found by itself, GSV-Cities, one folder a place, or @utm names put into cells."""
+    kind: Literal["auto", "gsv_cities", "msls", "folders", "utm"] = "auto"
+    """Layout of the source: found by itself, GSV-Cities, Mapillary SLS, one folder a place, or @utm names in cells."""
     cities: tuple[str, ...] = ()
-    """gsv_cities: city_ids to keep, for example '[PRS,Osaka]'; none keeps all."""
-    cell_m: float = 10.0
-    """utm: side of a place's cell in metres."""
-    heading_deg: float = 30.0
-    """utm: width of a place's heading sector in degrees; 0 puts all headings together."""
+    """gsv_cities, msls: cities to keep, for example '[PRS,Osaka]'; none keeps all (msls: all but cph and sf)."""
+    cell_m: float | None = None
+    """utm, msls: side of a place's cell in metres; 10 (utm) or 25 (msls) where it is not given."""
+    heading_deg: float | None = None
+    """utm, msls: width of a place's sector of headings in degrees; 30 (utm) or 60 (msls) where not given; 0: all."""
     workers: int = 0
     """Processes; 0 is one a core, where there is work for it. The bytes do not depend on it."""
     overwrite: bool = False
@@ -80,10 +80,13 @@ def prepare(config: PrepareConfig, source: Path, out: Path) -> None:
     """Reads the source, writes the shard set, prints the summary."""
     from shards.images import ImageRule
     from shards.sources.registry import SourceRule, read_source, reading_settings
-    from shards.writer import WriteRule, remove_shards, write_shards
+    from shards.writer import WriteRule, check_writable, remove_shards, write_shards
 
+    check_writable(out)
     reading = SourceRule(config.kind, tuple(config.cities), config.cell_m, config.heading_deg)
     catalogue = read_source(source, reading)
+    for remark in catalogue.remarks:
+        print(f"{source}: {remark}")
     if config.overwrite:
         remove_shards(out)
     image = ImageRule(config.check, config.resize)

@@ -159,7 +159,7 @@ def _is_finished(task: GroupTask) -> bool:
             with (task.out / shard["name"]).open("rb") as stream:
                 if hashlib.file_digest(stream, "sha256").hexdigest() != shard["sha256"]:
                     return False
-    except (OSError, pa.ArrowInvalid, ValueError, KeyError):
+    except (OSError, pa.ArrowException, ValueError, KeyError, TypeError):
         return False
     return True
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.common.text import Table, csv_text
+from pipeline.common.text import shown
 from shards.catalogue import LeftOut
 
 
@@ -48,8 +49,16 @@ class Summary:
 
 
 def report_bytes(left_out: Iterable[LeftOut]) -> bytes:
-    """report.csv: file, city, place, reason; a line with an empty file is about a whole place."""
+    """report.csv: file, city, place, reason; a line with an empty file is about a whole place.
+
+    Control characters of names are escaped. A name that a spreadsheet would take for a formula gets `./` (the same
+    file) or, as a city or place, an apostrophe in front.
+    """
     return csv_text([LeftOut._fields, *sorted(left_out)]).encode()
+
+
+def _plain(text: str, before: str) -> str:
+    return before + text if text.startswith(("=", "+", "-", "@")) else text
 
 
 def reasons(left_out: Iterable[LeftOut]) -> dict[str, int]:

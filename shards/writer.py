@@ -14,6 +14,7 @@ import multiprocessing
 import os
 import re
 import shutil
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -29,6 +30,7 @@ import pyarrow.compute as pc
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import write_atomically
 from pipeline.common.progress import Progress
+from pipeline.common.text import shown as readable
 from shards import groups, index, report, schema
 from shards.catalogue import Catalogue, LeftOut
 from shards.images import QUALITY, ImageRule
@@ -74,7 +76,13 @@ def write_shards(catalogue: Catalogue, out: Path, rule: WriteRule | None = None)
         DataError: more than `max_bad` of the images are missing or broken (all named in report.csv), or no place has
             four images.
     """
-    rule = _completed(rule or WriteRule(), catalogue)
+    try:
+        return _write(catalogue, out, _completed(rule or WriteRule(), catalogue))
+    except OSError as error:
+        raise UsageError(f"{readable(out)}: {error}; finished shards are kept, the same command continues") from error
+
+
+def _write(catalogue: Catalogue, out: Path, rule: WriteRule) -> report.Summary:
     settings = rule.settings(catalogue)
     if (done := _already(out, settings)) is not None:
         return done
@@ -89,26 +97,49 @@ def write_shards(catalogue: Catalogue, out: Path, rule: WriteRule | None = None)
         )
     out.mkdir(parents=True, exist_ok=True)
     _check_space(out, plan, rule)
-    try:
-        with _begun(out, settings):
-            with Progress("writing shards", plan.images, "images") as progress:
-                for images in _write_groups(plan, out, rule):
-                    progress.advance(images)
-            counts, left_out = _complete(catalogue, plan, out, rule, settings)
-        shutil.rmtree(out / schema.UNFINISHED)
-    except OSError as error:
-        raise UsageError(f"{out}: {error}; finished shards are kept, the same command continues") from error
+    with _begun(out, settings):
+        with Progress("writing shards", plan.images, "images") as progress:
+            for images in _write_groups(plan, out, rule):
+                progress.advance(images)
+        counts, left_out = _complete(catalogue, plan, out, rule, settings)
+    shutil.rmtree(out / schema.UNFINISHED)
     return report.Summary(str(out), counts, report.reasons(left_out), time.monotonic() - start, plan.images)
 
 
+def check_writable(out: Path) -> None:
+    """Whether the shards can be written to `out`, before any work is done; leaves nothing behind.
+
+    Raises:
+        UsageError: they cannot, such as on a read-only file system.
+    """
+    made = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
+    try:
+        if not out.is_file():  # told later, with what else may be wrong with it
+            out.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=out).close()
+    except (OSError, ValueError) as error:  # ValueError: a name with a NUL
+        told = (isinstance(error, OSError) and error.strerror) or error
+        raise UsageError(f"--out {readable(out)}: cannot be written ({told}); give another folder") from None
+    finally:
+        for folder in made:
+            with contextlib.suppress(OSError, ValueError):
+                folder.rmdir()
+
+
 def remove_shards(out: Path) -> None:
-    """Deletes the files of a shard set, finished or not, and nothing else; the manifest first."""
-    if out.is_dir():
-        for path in sorted(out.iterdir(), key=lambda p: (p.name != schema.MANIFEST, p.name)):
+    """Deletes the files of a shard set, finished or not, and nothing else; the manifest first.
+
+    Raises:
+        UsageError: they cannot be deleted.
+    """
+    try:
+        for path in sorted(out.iterdir() if out.is_dir() else [], key=lambda p: (p.name != schema.MANIFEST, p.name)):
             if path.name == schema.UNFINISHED:
                 shutil.rmtree(path)
             elif _is_ours(path.name):
                 path.unlink()
+    except OSError as error:
+        raise UsageError(f"--out {readable(out)}: the earlier shards cannot be deleted ({error.strerror})") from None
 
 
 def _completed(rule: WriteRule, catalogue: Catalogue) -> WriteRule:
@@ -131,7 +162,7 @@ def _already(out: Path, settings: dict[str, Any]) -> report.Summary | None:
         raise UsageError(f"--out {out}: is a file")
     names = {path.name for path in out.iterdir()}
     if foreign := sorted(name for name in names if not _is_ours(name)):
-        raise UsageError(f"--out {out}: holds other files ({foreign[0]}); give an empty folder or a new name")
+        raise UsageError(f"--out {out}: holds other files ({readable(foreign[0])}); give an empty folder or a new name")
     earlier = out / schema.UNFINISHED / SETTINGS
     if schema.MANIFEST in names:
         found = index.read_index(str(out)).manifest
@@ -143,10 +174,21 @@ def _already(out: Path, settings: dict[str, Any]) -> report.Summary | None:
             shutil.rmtree(out / schema.UNFINISHED)
         return report.Summary(str(out), found["counts"], found["left_out"], 0.0, 0)
     if earlier.exists():
-        _compare(out, json.loads(earlier.read_bytes()), settings)
+        _compare(out, _settings(earlier), settings)
     elif any(name.endswith(".tar") for name in names):
         raise UsageError(f"--out {out}: holds shards without a manifest; start with --overwrite to write the set again")
     return None
+
+
+def _settings(path: Path) -> dict[str, Any]:
+    """The settings of a set that was begun."""
+    try:
+        settings = json.loads(path.read_bytes())
+    except (ValueError, RecursionError):
+        settings = None
+    if not isinstance(settings, dict):
+        raise UsageError(f"{path}: not readable; start with --overwrite to write the set again")
+    return settings
 
 
 def _compare(out: Path, before: dict[str, Any], now: dict[str, Any]) -> None:

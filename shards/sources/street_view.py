@@ -124,10 +124,15 @@ def _pictures(root: Path, left_out: list[LeftOut]) -> Iterator[tuple[str, int]]:
     """(path from the root, bytes or what stands for them) of every picture file; adds folders that cannot be read."""
 
     def refused(folder: str, why: str) -> None:
+        folder = shown(folder, 4096)
         *above, place = folder.split("/")
         left_out.append(LeftOut(folder + "/", "/".join(above) or ".", place, f"cannot be read: {why}"))
 
-    return files_below(root, READ + UNREAD, refused)
+    for path, size in files_below(root, READ + UNREAD, refused):
+        if any("\ud800" <= c <= "\udfff" for c in path):  # how Python writes bytes that are no UTF-8
+            left_out.append(LeftOut(shown(path, 4096), "", "", "its name is not UTF-8"))
+        else:
+            yield path, size
 
 
 def _refuse_degrees(root: Path, named: Sequence[tuple[str, float, float]]) -> None:
