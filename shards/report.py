@@ -11,8 +11,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.common.text import Table, csv_text
-from pipeline.common.text import shown
+from pipeline.common.text import FORMULA, Table, csv_text
 from shards.catalogue import LeftOut
 
 
@@ -51,14 +50,12 @@ class Summary:
 def report_bytes(left_out: Iterable[LeftOut]) -> bytes:
     """report.csv: file, city, place, reason; a line with an empty file is about a whole place.
 
-    Control characters of names are escaped. A name that a spreadsheet would take for a formula gets `./` (the same
-    file) or, as a city or place, an apostrophe in front.
+    A file's name that a spreadsheet would run as a formula (@utm names begin so) gets `./` before it, which names the
+    same file.
     """
-    return csv_text([LeftOut._fields, *sorted(left_out)]).encode()
-
-
-def _plain(text: str, before: str) -> str:
-    return before + text if text.startswith(("=", "+", "-", "@")) else text
+    rows = sorted(left_out)
+    told = [(f"./{item.file}" if item.file.startswith(FORMULA) else item.file, *item[1:]) for item in rows]
+    return csv_text([LeftOut._fields, *told]).encode()
 
 
 def reasons(left_out: Iterable[LeftOut]) -> dict[str, int]:

@@ -38,14 +38,17 @@ def read_frame(path: Path, columns: Sequence[str]) -> pa.Table:
         DataError: it is no such table; names what is missing or the row that is wrong.
     """
     data = _content(path)
-    separator = _separator(data, path, columns)
+    separator, names = _header(data, path, columns)
     block = min(max(len(data), 1 << 16), 1 << 24)  # a row must fit into a block
     convert = csv.ConvertOptions(
         column_types=dict.fromkeys(columns, pa.string()), include_columns=list(columns), strings_can_be_null=False
     )
     try:
         rows = csv.read_csv(
-            io.BytesIO(data), csv.ReadOptions(block_size=block), csv.ParseOptions(delimiter=separator), convert
+            io.BytesIO(data),
+            csv.ReadOptions(block_size=block, skip_rows=1, column_names=names),
+            csv.ParseOptions(delimiter=separator),
+            convert,
         )
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
         raise DataError(f"{shown(path)}: not a readable CSV file: {shown(error)}") from None
@@ -106,17 +109,18 @@ def _content(path: Path) -> bytes:
     return data
 
 
-def _separator(data: bytes, path: Path, columns: Sequence[str]) -> str:
+def _header(data: bytes, path: Path, columns: Sequence[str]) -> tuple[str, list[str]]:
+    """The separator, and a name for each column: its own where it is wanted, else its number."""
     header = data[:65536].removeprefix(_BOM).split(b"\n", 1)[0]
     try:
         first = header.decode().strip("\r\n")
     except UnicodeDecodeError:
         raise DataError(f"{shown(path)}: its first line is no UTF-8 text; save it as CSV in UTF-8") from None
-    found = {s: [name.strip().strip('"') for name in first.split(s)] for s in _SEPARATORS}
+    found = {s: [name.strip().strip('"').strip() for name in first.split(s)] for s in _SEPARATORS}
     best = max(_SEPARATORS, key=lambda s: len(set(columns) & set(found[s])))
     if missing := [name for name in columns if name not in found[best]]:
         told = f"no column {', '.join(missing)}; columns needed: {', '.join(columns)}"
         raise DataError(f"{shown(path)}: {told}; its first line is '{shown(first, 100)}'")
     if twice := [name for name in columns if found[best].count(name) > 1]:
         raise DataError(f"{shown(path)}: two columns are called {twice[0]}")
-    return best
+    return best, [name if name in columns else f"#{i}" for i, name in enumerate(found[best])]

@@ -102,7 +102,17 @@ def test_cities_can_be_chosen(gsv: Callable[..., Path]) -> None:
         ("", "PRS.csv"),
         (HEADER + "one,2015,1,0,PRS,48.5,2.5,p\n", "place_id"),
         (HEADER + "1,2015,1.5,0,PRS,48.5,2.5,p\n", "month"),
-        (HEADER + "1,2015,1,0,PRS,north,2.5,p\n", "lat"),
+        (HEADER + "1,2015,1,0,PRS,48.5,2.5,p\n1,2015,1,0,PRS,north,2.5,p\n", r"PRS\.csv: row 2: lat is 'north', not a"),
+        (HEADER + "1,2015,1,0,PRS,nan,2.5,p\n", "row 1: lat is 'nan', not a number from -90 to 90"),
+        (HEADER + "1,2015,1,0,PRS,48.5,1e400,p\n", "row 1: lon is '1e400'"),
+        (HEADER + "1,99999999999,1,0,PRS,48.5,2.5,p\n", "row 1: year is '99999999999'"),
+        (HEADER + "1,2015,1,0,../..,48.5,2.5,p\n", r"row 1: city_id is '\.\./\.\.', not the plain name"),
+        (HEADER + "1,2015,1,0,/etc,48.5,2.5,p\n", "row 1: city_id is '/etc'"),
+        (HEADER + "1,2015,1,0,a\x1bb,48.5,2.5,p\n", r"row 1: city_id is 'a\\x1bb'"),
+        (HEADER + "1,2015,1,0,PRS\n", "Expected 8 columns, got 5"),
+        (HEADER.replace("lat", "place_id"), "no column lat"),
+        (HEADER.replace("\n", ",lat\n") + "1,2015,1,0,PRS,48.5,2.5,p,1\n", "two columns are called lat"),
+        (HEADER.replace(",", ";") + "1;2015;1;0;PRS;48,5;2,5;p\n", "row 1: lat is '48,5'"),
     ],
 )
 def test_a_malformed_frame_is_named(text: str, message: str, tmp_path: Path) -> None:
@@ -111,6 +121,68 @@ def test_a_malformed_frame_is_named(text: str, message: str, tmp_path: Path) -> 
     with pytest.raises(DataError, match=message) as caught:
         gsv_cities.read(root)
     assert "PRS.csv" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("how", ["bom", "crlf", "semicolons", "quotes", "tabs", "spaces", "long"])
+def test_a_frame_saved_by_another_program_is_read(how: str, tmp_path: Path) -> None:
+    text = HEADER + "1,2015,1,0,PRS,48.50,2.5,p_é\n"
+    text = {
+        "bom": "\ufeff" + text, "crlf": text.replace("\n", "\r\n"), "semicolons": text.replace(",", ";"),
+        "quotes": '"' + text.replace(",", '","').replace("\n", '"\n"', 1).replace("é\n", 'é"\n'),
+        "tabs": text.replace(",", "\t"), "spaces": text.replace(",", ", "),
+        "long": text.replace("panoid", "panoid,note").replace("é\n", "é," + "x" * 3_000_000 + "\n"),
+    }[how]  # fmt: skip
+    root = folder(tmp_path, [], {"PRS_0000001_2015_01_000_48.50_2.5_p_é.jpg": b"1"})
+    (root / "Dataframes" / "PRS.csv").write_bytes(text.encode())
+    assert gsv_cities.read(root).table["size"].to_pylist() == [1]
+
+
+def test_other_encodings_and_damaged_archives_are_named(tmp_path: Path) -> None:
+    text = (HEADER + "1,2015,1,0,PRS,48.5,2.5,é\n").encode("utf-16")
+    packed = gzip.compress(HEADER.encode())
+    root = folder(tmp_path, [], {})
+    (root / "Dataframes" / "PRS.csv").unlink()
+    bad = {"a.csv": text, "b.csv": text.decode("utf-16").encode("latin-1"), "c.csv.gz": packed[:-9], "d.csv.gz": b"csv"}
+    for name, data in bad.items():
+        (root / "Dataframes" / name).write_bytes(data)
+        with pytest.raises(DataError, match=rf"{name}: ") as caught:
+            gsv_cities.read(root)
+        assert str(caught.value).isprintable()
+        (root / "Dataframes" / name).unlink()
+
+
+@pytest.mark.parametrize("where", [".", "one/level/up", "lower"])
+def test_the_layout_is_found_in_any_case_and_one_level_down(where: str, gsv: Callable[..., Path]) -> None:
+    """A copy made on a Mac has `._PRS.csv` beside `PRS.csv`, and so on in every folder."""
+    root = gsv({"PRS": [4]})
+    (root / "Dataframes" / "._PRS.csv").write_bytes(b"\0\5\x16\7Mac OS X")
+    (root / "Images" / "PRS" / "._x.jpg").write_bytes(b"1")
+    (root / "Images" / ".DS_Store").write_bytes(b"1")
+    (root / "__MACOSX" / "Images").mkdir(parents=True)
+    if where == "lower":
+        for name in ("Images", "Dataframes"):
+            (root / name).rename(root / name.lower())
+    found = read_source(root.parent if where == "one/level/up" else root)
+    assert (found.kind, found.images, found.unlisted, len(found.left_out)) == ("gsv_cities", 4, 0, 0)
+    assert bool(found.remarks) == (where == "one/level/up")
+
+
+def test_parts_of_the_layout_are_refused_by_name(gsv: Callable[..., Path], tmp_path: Path) -> None:
+    root = gsv({"PRS": [4], "OSL": [4]})
+    for part in ("Images", "Dataframes"):
+        with pytest.raises(UsageError, match=rf"is GSV-Cities' {part}/ alone; give .*source"):
+            detect(root / part)
+    with pytest.raises(UsageError, match="named as GSV-Cities'"):
+        detect(root / "Images" / "PRS")
+    (root / "Images").rename(tmp_path / "photos")
+    with pytest.raises(UsageError, match=r"named as GSV-Cities', but there is no Dataframes/"):
+        detect(tmp_path / "photos")
+    assert read_source(tmp_path / "photos", SourceRule(kind="folders")).listed.num_rows == 2
+    other = gsv({"PRS": [4]}, "another")
+    (root / "Dataframes").rename(other / "dataframes2")
+    gsv({"PRS": [4]}, "third")
+    with pytest.raises(UsageError, match=r"several data sets \(another, third\)"):
+        detect(tmp_path)
 
 
 def test_half_a_layout_is_refused(tmp_path: Path) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
 
 from pipeline.common.errors import DataError, UsageError
+from shards.catalogue import LeftOut
+from shards.report import report_bytes
 from shards.sources.registry import SourceRule, detect, read_source
 
 
@@ -93,3 +97,90 @@ def test_the_layout_can_be_forced(tmp_path: Path) -> None:
 def test_an_empty_folder_is_told(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no photos"):
         read_source(tmp_path)
+
+
+def test_pittsburghs_views_are_told_apart_by_the_yaw_in_their_note(tmp_path: Path) -> None:
+    """24 views around one spot: two pitches of twelve directions, the heading field empty."""
+    names = [
+        f"@0585001.00@4477001.00@17@T@040.44110@-079.99810@000829@{24 * p + y:02d}@@@@@@pitch{p}_yaw{y}@.jpg"
+        for p in (1, 2)
+        for y in range(1, 13)
+    ]
+    put(tmp_path, *names, "@0585001.00@4477001.00@17@T@040.4@-080.0@000829@@@@@@@@.jpg")
+    found = read_source(tmp_path)
+    assert [p["images"] for p in found.listed.to_pylist()] == [1] + [2] * 12
+    assert {row["bearing"] for row in found.table.to_pylist()} == {None, *(30.0 * y for y in range(12))}
+    (told,) = found.remarks
+    assert "25 of 25 photos have no heading" in told and "24 are put by the yaw" in told and "1 into one place" in told
+
+
+def test_sf_xls_names_are_read_with_their_heading_and_month(tmp_path: Path) -> None:
+    """As published: latitude folders, heading in degrees without zeros, year and month together."""
+    stem = "@054325{}.96@4178906.70@10@S@037.75645@-122.50893@L-2IR8dif5bpYQIeb5o7oQ@@{}@@@@201502@@.jpg"
+    put(tmp_path, *("train/37.75/" + stem.format(i, h) for i, h in ((1, 0), (2, 29), (3, 30), (4, 359))))
+    found = read_source(tmp_path / "train")
+    places = {row["bearing"]: row["place_id"] for row in found.table.to_pylist()}
+    assert places == {0: "54325_417890_0", 29: "54325_417890_0", 30: "54325_417890_1", 359: "54325_417890_11"}
+    row = found.table.to_pylist()[0]
+    assert (row["city"], row["lat"], row["lon"], row["year"], row["month"]) == ("10S", 37.75645, -122.50893, 2015, 2)
+    assert not found.remarks
+
+
+def test_degrees_in_the_place_of_metres_are_refused(tmp_path: Path) -> None:
+    put(tmp_path, *(f"@-122.5089{i}@37.75645@10@S@37.7@-122.5@p@@{i}@@@@@@.jpg" for i in range(4)))
+    with pytest.raises(DataError, match=r"degrees where UTM metres are due, such as @-122\.509@37\.7565@ in @-122"):
+        read_source(tmp_path)
+
+
+def test_a_name_without_degrees_gets_them_from_its_metres(tmp_path: Path) -> None:
+    names = ["@0448252.00@5411943.00@31@U@@@eiffel@@@@@@@@.jpg", "@0334368.00@6250948.00@56@H@@@opera@@@@@@@@.jpg"]
+    put(tmp_path, *names, "@0448252.00@5411943.00@@@@@nowhere@@@@@@@@.jpg")
+    found = {row["path"].split("@")[7]: (row["lat"], row["lon"]) for row in read_source(tmp_path).table.to_pylist()}
+    assert found["nowhere"] == (None, None)
+    assert found["eiffel"] == pytest.approx((48.85837, 2.29448), abs=1e-4)
+    assert found["opera"] == pytest.approx((-33.8654, 151.2096), abs=1e-2)  # the southern hemisphere
+
+
+def test_the_splits_of_an_evaluation_set_are_not_put_together(tmp_path: Path) -> None:
+    for split in ("train", "val", "test"):
+        put(tmp_path, f"images/{split}/database/" + utm(500001, 6900001, "10"))
+    with pytest.raises(UsageError, match=r"holds train, val, test .* give one of them, such as .*/images/train"):
+        read_source(tmp_path)
+    assert read_source(tmp_path / "images" / "train").images == 1
+
+
+def test_debris_is_passed_over_and_odd_names_are_named(tmp_path: Path) -> None:
+    put(tmp_path, *(f"cafe/{n}.jpg" for n in range(4)), "cafe/._1.jpg", "cafe/.DS_Store", "cafe/Thumbs.db")
+    put(tmp_path, "__MACOSX/cafe/1.jpg", "cafe/@eaDir/1.jpg", "line\nfeed/=1+1.jpg")
+    bad = os.fsencode(tmp_path / "cafe") + b"/\xff.jpg"
+    Path(os.fsdecode(bad)).write_bytes(b"1")
+    found = read_source(tmp_path)
+    assert found.images == 6
+    assert [tuple(x) for x in found.left_out] == [(r"cafe/\udcff.jpg", "", "", "its name is not UTF-8")]
+    told = report_bytes([*found.left_out, LeftOut("=cmd|x.jpg", "a\nb", "\x1b[31m", "broken")]).decode().splitlines()
+    assert told[1] == r"./=cmd|x.jpg,a\nb,\x1b[31m,broken" and len(told) == 3
+
+
+def test_a_folder_that_may_not_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests may run as root, whom no permission stops: the system's answer is made."""
+    put(tmp_path, "Lisbon/cafe/1.jpg", "Lisbon/square/1.jpg", "Lisbon/square/2.jpg")
+    scan, stat = os.scandir, os.stat
+
+    def no_scan(path: str) -> object:
+        if str(path).endswith("cafe"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return scan(path)
+
+    def no_stat(path: object, **options: object) -> object:
+        if str(path).endswith("square/2.jpg"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return stat(path, **options)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(os, "scandir", no_scan)
+    monkeypatch.setattr(os, "stat", no_stat)
+    found = read_source(tmp_path, SourceRule(kind="folders"))
+    assert found.images == 3 and found.table.num_rows == 1
+    assert [tuple(x) for x in found.left_out] == [
+        ("Lisbon/cafe/", "Lisbon", "cafe", "cannot be read: Permission denied"),
+        ("Lisbon/square/2.jpg", "Lisbon", "square", "cannot be read: no permission"),
+    ]
