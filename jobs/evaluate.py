@@ -16,10 +16,12 @@ from __future__ import annotations
 import dataclasses
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from jobs.cli import parse, run_job
 from pipeline.common.errors import UsageError
+from pipeline.common.files import check_writable
 from pipeline.config import EvaluationConfig, to_dict
 
 
@@ -66,6 +68,7 @@ def main() -> None:
 
 def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None:
     """The evaluation on this process; rank 0 writes."""
+    from pipeline.distributed import on_rank_0
     from pipeline.evaluation.evaluate import evaluate, fit_projections, model_fingerprint
     from pipeline.evaluation.predictions import save_results
     from pipeline.evaluation.report import html, tables
@@ -75,13 +78,14 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
 
     device, first = accelerator.device, accelerator.is_main_process  # type: ignore[attr-defined]
     file = checkpoint_file(job.checkpoint)
+    runs = [parent.parent for parent in file.parents if parent.name == "checkpoints"]
+    output = Path(job.output) if job.output else (runs[0] if runs else file.parent) / "evaluation"
+    on_rank_0(partial(check_writable, output, "--output"))
     names = config.sets or tuple(a.name for a in available(config.root, config.split) if a.folder is not None)
     sets, left_out = load_sets(names, config)
     for line in left_out if first else ():
         print(f"left out: {line}", file=sys.stderr)
     model = load_any(file, device)
-    runs = [parent.parent for parent in file.parents if parent.name == "checkpoints"]
-    output = Path(job.output) if job.output else (runs[0] if runs else file.parent) / "evaluation"
     fingerprint = model_fingerprint(model)
     projections = None
     if config.pca and config.pca_from:
@@ -121,12 +125,13 @@ def stored(job: EvaluateJob, folder: Path, config: EvaluationConfig) -> None:
     from pipeline.evaluation.report import tables
     from pipeline.evaluation.sets.load import load_sets
 
+    output = Path(job.output) if job.output else folder / "from_store"
+    check_writable(output, "--output")
     sets, left_out = load_sets(config.sets or stored_sets(folder), config)
     for line in left_out:
         print(f"left out: {line}", file=sys.stderr)
     results = evaluate_stores(folder, sets, config, (None, *job.dimensions))
     tables.show(results)
-    output = Path(job.output) if job.output else folder / "from_store"
     save_results(results, sets, output, {"stores": str(folder), "evaluation": to_dict(config), "left_out": left_out})
     print(f"\nwritten to {output}/")
 

@@ -20,6 +20,7 @@ from typing import Any, Literal
 
 from jobs.cli import parse, run_job
 from pipeline.common.errors import DataError, UsageError
+from pipeline.common.files import check_writable
 from pipeline.config import EvaluationConfig, ModelConfig
 
 
@@ -67,6 +68,7 @@ def main() -> None:
         return
     if not job.checkpoint:
         raise UsageError("--checkpoint is missing: a run folder such as outputs/cricavpr, or a model file")
+    check_writable(Path(job.to).parent, "--to")
     import torch
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

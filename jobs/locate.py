@@ -20,6 +20,7 @@ from typing import Literal
 
 from jobs.cli import parse, run_job
 from pipeline.common.errors import UsageError
+from pipeline.common.files import check_writable
 
 SHOWN = 12  # photos that ask, in the picture; the text and the JSON have all
 
@@ -104,6 +105,12 @@ def run(job: LocateJob) -> None:
     photos = asked(job.photos)
     device = job.device if job.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
     file, folder = checkpoint_file(job.checkpoint), Path(job.index)
+    if job.build:
+        check_writable(folder, "--index")
+    if photos and job.output:
+        check_writable(Path(job.output), "--output")
+    elif photos and folder.is_dir():
+        check_writable(folder, "--output")
     model = load_any(file, device)
     fingerprint = model_fingerprint(model)
     if job.build:

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
+
+from pipeline.common.errors import UsageError
+from pipeline.common.text import shown
 
 
 def write_atomically(path: Path, data: bytes, temporary: Path | None = None) -> None:
@@ -15,6 +19,21 @@ def write_atomically(path: Path, data: bytes, temporary: Path | None = None) -> 
         os.fsync(stream.fileno())
     temporary.rename(path)
     sync_path(path.parent)
+
+
+def check_writable(folder: Path, option: str) -> None:
+    """Makes `folder` where it is not there and writes a file into it, before any work is done for it.
+
+    Raises:
+        UsageError: it cannot be made or written; names the folder, the reason, and the `option` that gives another.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"x")
+    except (OSError, ValueError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise UsageError(f"{shown(folder)}: cannot be written ({reason}); give another folder with {option}") from None
 
 
 def reserve(path: Path, size: int) -> None:

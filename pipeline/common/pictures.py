@@ -128,4 +128,5 @@ def _too_large(told: str) -> str:
 
 
 def _reason(error: Exception) -> str:
-    return shown(str(error) or type(error).__name__)
+    text = re.sub(r" *<_io\.[^>]*>", "", str(error))  # an address in memory says nothing, and differs on every rank
+    return shown(text or type(error).__name__)

@@ -17,6 +17,7 @@ from torch import nn
 
 from pipeline.common.errors import DataError
 from pipeline.common.progress import track
+from pipeline.evaluation.describe.broken import broken_photos, problem_of
 from pipeline.evaluation.describe.encode import describe_alone, evaluating
 from pipeline.evaluation.search.exact import search_index
 from pipeline.evaluation.sets.utm import WIDEST, meridian_offset, metres_between, to_utm
@@ -72,13 +73,17 @@ def locate(
     """The `count` most similar photos of an index (fewer where it holds fewer) for each of `photos`.
 
     Raises:
-        DataError: a photo that does not decode (named), or whose descriptor is not finite.
+        DataError: photos that do not decode (all named, `broken_photos`), or whose descriptor is not finite.
     """
     device, protocol = torch.device(device), index.protocol
     answers = []
     with evaluating(model):
         for photo in track(photos, "locating", unit="photos") if progress else photos:
-            described = describe_alone(model, photo, protocol.resize, protocol.precision, device)
+            try:
+                described = describe_alone(model, photo, protocol.resize, protocol.precision, device)
+            except DataError as error:
+                broken = [at for at, other in enumerate(photos) if problem_of(other)]
+                raise broken_photos(photos, broken, "photos to locate") from error
             if not np.isfinite(described).all():
                 raise DataError(f"{photo}: its descriptor is not finite: the model has diverged; take another one")
             if index.projection is not None:

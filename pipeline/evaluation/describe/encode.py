@@ -26,11 +26,12 @@ import torch
 from torch import Tensor, nn
 
 from pipeline import distributed
-from pipeline.common.errors import DataError, told
+from pipeline.common.errors import told
 from pipeline.common.files import reserve
 from pipeline.common.progress import Progress
 from pipeline.config import EvaluationConfig
 from pipeline.data.images import load_image, normalise, to_input
+from pipeline.evaluation.describe.broken import broken_photos
 from pipeline.evaluation.protocol import Protocol, Side
 
 ALONE = 64  # images correlated in one call where each is a group of its own
@@ -62,8 +63,8 @@ def calls_of(protocol: Protocol, images: int, side: Side, model: Any) -> tuple[l
     return protocol.form(images, side, ALONE), True
 
 
-class _Batches(torch.utils.data.Dataset[tuple[Tensor, str]]):
-    """The forward batches of one rank, decoded: item i is ([n, 3, S, S], "") or (nothing, what is broken)."""
+class _Batches(torch.utils.data.Dataset[tuple[Tensor, list[int]]]):
+    """The forward batches of one rank, decoded: item i is ([n, 3, S, S], []) or (nothing, positions of broken ones)."""
 
     def __init__(self, paths: Sequence[Path], batches: list[np.ndarray], size: int, resize: Any) -> None:
         self.paths, self.batches, self.size, self.resize = paths, batches, size, resize
@@ -71,14 +72,16 @@ class _Batches(torch.utils.data.Dataset[tuple[Tensor, str]]):
     def __len__(self) -> int:
         return len(self.batches)
 
-    def __getitem__(self, index: int) -> tuple[Tensor, str]:
-        try:
-            images = [to_input(load_image(self.paths[p]), self.size, self.resize) for p in self.batches[index]]
-        except Exception as error:  # as one line: torch would wrap it in a traceback
-            if (mended := told(error)) is None:
-                raise
-            return torch.empty(0), str(mended)
-        return torch.stack(images), ""
+    def __getitem__(self, index: int) -> tuple[Tensor, list[int]]:
+        images, broken = [], []
+        for position in self.batches[index].tolist():
+            try:
+                images.append(to_input(load_image(self.paths[position]), self.size, self.resize))
+            except Exception as error:
+                if told(error) is None:
+                    raise
+                broken.append(position)
+        return (torch.empty(0), broken) if broken else (torch.stack(images), [])
 
 
 @dataclass
@@ -125,6 +128,7 @@ def encode(
     scratch: Path | None = None,
     key: str = "",
     progress: bool = True,
+    beyond: Sequence[Path] = (),
 ) -> Regions:
     """Runs the per-image part over `paths`, each once. Collective.
 
@@ -134,8 +138,10 @@ def encode(
         scratch: folder for the regions of sets too large for memory; None: memory alone.
         key: what the regions depend on; a file in `scratch` left by a killed run with the same key is continued.
 
+        beyond: photos that will be described next; where one of `paths` is broken, these are looked through too.
+
     Raises:
-        DataError: images that cannot be read, named, on all ranks alike.
+        DataError: images that cannot be read, all of them (`broken_photos`), on all ranks alike.
     """
     w, r = distributed.world_size(), distributed.rank()
     mine = [block[j] for blocks in wanted for block in blocks for j in range(r, len(block), w)]
@@ -154,13 +160,15 @@ def encode(
     loader = iter(_loader(_Batches(paths, own, size, config.resize), config.workers))
     total = sum(len(batch) for batch in batches[first * w :])
     problem: BaseException | None = None
+    broken: list[int] = []
     with Progress(label, total, "images", enabled=progress and r == 0) as bar:
         for step in range(first, steps):
             dealt = batches[step * w : (step + 1) * w]
             images = torch.zeros(1, 3, size, size)
             if r < len(dealt) and problem is None:
-                images, problem = _next(loader)
-            distributed.agree(problem, what=label)
+                images, broken, problem = _next(loader)
+            if distributed.agree(problem, notice=len(broken), what=label):
+                break
             encoded = _forward(model.encode, images, config, device, dtype)  # type: ignore[arg-type]
             gathered = distributed.gather_uneven(encoded if r < len(dealt) else encoded[:0])
             try:
@@ -169,17 +177,36 @@ def encode(
             except OSError as error:  # told to the other ranks before the next forward pass
                 problem = error
             bar.advance(sum(len(batch) for batch in dealt))
-    distributed.agree(problem, what=label)
+    if distributed.agree(problem, notice=len(broken), what=label):
+        rest = np.arange(r, len(beyond), w)
+        last = _loader(
+            _Batches(beyond, [rest[i : i + 1] for i in range(len(rest))], size, config.resize), config.workers
+        )
+        found = distributed.agreed(partial(_broken, label, broken, loader, iter(last), len(paths), r == 0), what=label)
+        everyones = distributed.gather_uneven(torch.tensor(found, dtype=torch.int64, device=device))
+        raise broken_photos([*paths, *beyond], everyones.tolist(), label)
     return regions
 
 
-def _next(loader: Iterator[tuple[Tensor, str]]) -> tuple[Tensor, BaseException | None]:
-    """The next batch, or what is wrong with it."""
+def _broken(
+    label: str, known: list[int], loader: Iterator[Any], beyond: Iterator[Any], paths: int, progress: bool
+) -> list[int]:
+    """Positions of this rank's broken photos: those `known`, and those among what the loaders still hold."""
+    found = list(known)
+    with Progress(f"{label}: looking for other broken photos", None, "batches", enabled=progress) as bar:
+        for first, each in ((0, loader), (paths, beyond)):
+            for _, broken in each:
+                found += [first + position for position in broken]
+                bar.advance()
+    return found
+
+
+def _next(loader: Iterator[tuple[Tensor, list[int]]]) -> tuple[Tensor, list[int], BaseException | None]:
+    """The next batch, which of its images are broken, or what else is wrong with it."""
     try:
-        images, broken = next(loader)
+        return *next(loader), None
     except Exception as error:
-        return torch.empty(0), error
-    return images, DataError(broken) if broken else None
+        return torch.empty(0), [], error
 
 
 def describe_alone(model: nn.Module, photo: Path, resize: Any, precision: Any, device: torch.device) -> np.ndarray:
@@ -205,15 +232,18 @@ def describe_each(
     """(positions [n], descriptors [n, dim]) of images, each a group of its own, a forward batch at a time.
 
     For a model in `evaluating`, on one process; nothing is kept. With `config.batch` 1 each is what `describe_alone`
-    gives, to the last bit. Raises `DataError` naming a broken image, after what came before it was given.
+    gives, to the last bit. Raises `DataError` naming the broken images, after what came before the first was given.
     """
     size, together = int(model.image_size), getattr(model, "correlates_alone", False)  # type: ignore[arg-type]
     batches = [np.arange(s, min(s + config.batch, len(paths))) for s in range(0, len(paths), config.batch)]
     loader = _loader(_Batches(paths, batches, size, config.resize), config.workers)
     with Progress(label, len(paths), "images", enabled=progress) as bar:
-        for batch, (images, problem) in zip(batches, loader, strict=True):
-            if problem:
-                raise DataError(problem)
+        left = iter(loader)
+        for batch in batches:
+            images, broken = next(left)
+            if broken:
+                found = _broken(label, broken, left, iter(()), len(paths), progress)
+                raise broken_photos(paths, found, label)
             regions = _forward(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
             if together and len(batch) > 1:
                 described = model.correlate(regions, alone=True)  # type: ignore[operator]
@@ -290,7 +320,7 @@ def _zeros(shape: tuple[int, ...], dtype: Any) -> Tensor:
     return torch.from_numpy(np.zeros((1, *shape), dtype))
 
 
-def _loader(dataset: _Batches, workers: int) -> torch.utils.data.DataLoader[tuple[Tensor, str]]:
+def _loader(dataset: _Batches, workers: int) -> torch.utils.data.DataLoader[tuple[Tensor, list[int]]]:
     """Whole batches in order. Its own generator: a validation must not advance the training's random state."""
     workers = min(workers, len(dataset)) if len(dataset) > 1 else 0
     return torch.utils.data.DataLoader(

@@ -75,6 +75,7 @@ class Engine:
                 scratch,
                 f"{self.fingerprint} {files} {[p.grouping.name for p in missing]}" if self.fingerprint else "",
                 self.progress,
+                evaluated.queries if side == "database" else (),
             )
         alone = {p: together for p, (_, together) in calls.items()}
         label = f"{evaluated.name} {side}"

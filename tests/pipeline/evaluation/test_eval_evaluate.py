@@ -115,8 +115,15 @@ def test_model_mode_and_random_state_are_left_as_they_were(tmp_path: Path) -> No
 def test_a_broken_image_is_named(tmp_path: Path, workers: int) -> None:
     evaluated = make_set(tmp_path)
     evaluated.database[20].write_bytes(b"\xff\xd8 not really a photo")
-    with pytest.raises(DataError, match=r"020\.png"):
+    with pytest.raises(DataError, match=r"^[^;]*020\.png: [^;]*; restore the file or leave it out$"):
         evaluate(Tiny(), [evaluated], dataclasses.replace(CONFIG, workers=workers), "cpu", progress=False)
+    broken = [*evaluated.database[5:30:4], *evaluated.queries[2:6]]  # both sides, in many batches
+    for number, photo in enumerate(broken):
+        photo.write_bytes(b"") if number % 2 else photo.unlink()
+    with pytest.raises(DataError, match=r"12 broken photos: .*; and 2 more\. Restore the files") as caught:
+        evaluate(Tiny(), [evaluated], dataclasses.replace(CONFIG, workers=workers), "cpu", progress=False)
+    named = [photo for photo in broken if str(photo) in str(caught.value)]
+    assert len(named) == 9 and "020.png" in str(caught.value), "the first ten in the set's order"
 
 
 def test_parts_are_searched_apart(tmp_path: Path) -> None:
@@ -221,6 +228,9 @@ def test_the_number_of_processes_changes_nothing(tmp_path: Path) -> None:
 
 def test_a_broken_image_ends_all_processes_with_its_name(tmp_path: Path) -> None:
     evaluated = make_set(tmp_path)
-    evaluated.queries[11].write_bytes(b"nothing")
+    for photo in (evaluated.database[36], evaluated.database[3]):  # of both ranks
+        photo.write_bytes(b"nothing")
     on_processes(2, tmp_path / "broken", evaluated, broken=True)
-    assert all("011.png" in (tmp_path / f"broken/rank{r}.txt").read_text() for r in range(2))
+    told = {(tmp_path / f"broken/rank{r}.txt").read_text() for r in range(2)}
+    assert len(told) == 1
+    assert all(name in next(iter(told)) for name in ("2 broken photos", "036.png", "003.png"))
