@@ -176,6 +176,34 @@ class Store:
     """Seconds after which a step is given up, and said so."""
 
 
+@dataclass(frozen=True)
+class Mine:
+    """Seconds of neighbours and plan of `data.order: mined`, and how the groups come out; on made descriptors.
+
+    python -m jobs.benchmark mine                                          57,462 made places
+    python -m jobs.benchmark mine --frames data/gsv-cities/Dataframes      GSV-Cities' places and positions
+    """
+
+    frames: str | None = None
+    """Folder of GSV-Cities' `<City>.csv` or `.csv.gz`; its images are not needed."""
+    places: int = 57_462
+    """How many places are made, without `frames`."""
+    dim: int = 256
+    """Numbers of a descriptor."""
+    places_per_batch: int = 72
+    """Places of a batch."""
+    clique: int = 6
+    """As data.clique."""
+    mine_neighbours: int = 64
+    """As data.mine_neighbours."""
+    mine_radius: float = 25.0
+    """As data.mine_radius; pairs closer than this in one batch are counted."""
+    mine_temperature: float = 0.05
+    """As data.mine_temperature."""
+    seed: int = 0
+    """Of the made descriptors and of the plan."""
+
+
 def main() -> None:
     """Parses, measures, prints."""
     part, job = parse_part({name: kind for name, (kind, _) in PARTS.items()}, __doc__ or "")
@@ -275,6 +303,17 @@ def store(job: Store) -> None:
         print(line, flush=True)
 
 
+def mine(job: Mine) -> None:
+    """Prints the machine, then a line a figure."""
+    from pipeline.benchmark import mining
+    from pipeline.data.cliques import CliqueRule
+
+    _device("cpu")
+    rule = CliqueRule(job.clique, job.mine_neighbours, job.mine_radius, job.mine_temperature)
+    for line in mining.measure(job.frames, job.places, job.dim, job.places_per_batch, rule, job.mine_radius, job.seed):
+        print(line, flush=True)
+
+
 PARTS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "step": (Step, step),
     "memory": (Memory, memory),
@@ -285,6 +324,7 @@ PARTS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "cost": (Cost, cost),
     "search": (Search, search),
     "store": (Store, store),
+    "mine": (Mine, mine),
 }
 
 

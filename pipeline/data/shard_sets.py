@@ -24,7 +24,8 @@ from pipeline.common.errors import UsageError
 from pipeline.config import DataConfig
 from pipeline.data.cache import ShardCache
 from pipeline.data.keyed import Rows
-from shards.index import SCHEMA, ShardIndex, read_index
+from shards.index import ShardIndex, read_index
+from shards.schema import SCHEMA
 
 PREFIXED = ("sample", "city", "shard")
 

@@ -10,9 +10,10 @@ import pytest
 import torch
 from processes import run_ranks
 
-from pipeline.benchmark import data, timing
+from pipeline.benchmark import data, mining, timing
 from pipeline.benchmark.ranks import BothForms
 from pipeline.benchmark.sizes import SIZES
+from pipeline.data.cliques import CliqueRule
 from pipeline.distributed import rank
 
 # not on the GPU machines that only compute; a name whose module is None cannot be imported
@@ -88,3 +89,15 @@ def test_the_step_on_a_gpu() -> None:
 
     found = step.measure(SIZES["tiny"], torch.device("cuda"), 2, 8, full=False)
     assert all(row.seconds > 0 for comparison in found for row in comparison.rows)
+
+
+def test_planning_mined_batches_is_measured(tmp_path: Path) -> None:
+    """On made places, and on those of a table with four images; the groups are alike, and none is near."""
+    rule = CliqueRule(3, 16, 25.0, 0.05)
+    lines = list(mining.measure(None, 460, 16, 12, rule, 25.0, 0))
+    assert lines[0].startswith("460 places in 23 cities") and "plan: 38 batches" in lines[2]
+    mined, city = (float(line.rsplit(" ", 1)[1]) for line in lines[-2:])
+    assert mined > 2 * city
+    rows = ["place_id,lat,lon", *(f"{place},{place},2" for place in range(30) for _ in range(4)), "99,1,1"]
+    (tmp_path / "Oslo.csv").write_text("\n".join(rows) + "\n")
+    assert next(mining.measure(str(tmp_path), 0, 16, 12, rule, 25.0, 0)).startswith("30 places in 1 cities")
