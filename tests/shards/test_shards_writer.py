@@ -21,7 +21,7 @@ from shards import groups, index, schema
 from shards.images import ImageRule
 from shards.report import Summary
 from shards.sources.registry import read_source
-from shards.writer import WriteRule, remove_shards, write_shards
+from shards.writer import WriteRule, check_writable, remove_shards, write_shards
 
 Gsv = Callable[..., Path]
 CITIES = {"PRS": [4, 5, 3, 37, 2, 8], "OSL": [6, 4, 1, 9]}
@@ -367,3 +367,41 @@ def test_two_runs_at_once_are_refused(gsv: Gsv, tmp_path: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(UsageError, match="another run"):
             write_shards(read_source(gsv({"PRS": [4]})), out, WriteRule(workers=1))
+
+
+def test_where_nothing_can_be_written_it_is_said_before_any_work(tmp_path: Path) -> None:
+    for out in (Path("/proc/shards/out"), Path("/sys/shards"), tmp_path / "a\0b"):
+        with pytest.raises(UsageError, match="cannot be written") as caught:
+            check_writable(out)
+        assert str(caught.value).isprintable()
+    check_writable(tmp_path / "deep" / "out")
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(UsageError, match="cannot be written"):
+        check_writable(tmp_path / "file" / "out")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_16_bit_photos_and_bombs_of_ones_own_folder(tmp_path: Path, photo: Callable[[int], bytes]) -> None:
+    """Deep grey is scaled, what would decode to gigabytes is named; neither is clipped or left out in silence."""
+    import struct
+    import zlib
+
+    from PIL import Image
+
+    source, out = tmp_path / "mine", tmp_path / "out"
+    (source / "cafe").mkdir(parents=True)
+    for n in range(3):
+        (source / "cafe" / f"{n}.jpg").write_bytes(photo(n))
+    ramp = np.tile(np.arange(0, 65536, 1024, dtype=np.uint16), (64, 1))
+    Image.fromarray(ramp).save(source / "cafe" / "deep.png")
+    head = b"IHDR" + struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    bomb = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head))
+    (source / "cafe" / "bomb.png").write_bytes(bomb + struct.pack(">I", 0) + b"IDAT" + struct.pack(">I", 0))
+    summary = write_shards(read_source(source), out, WriteRule(rounds=1, max_bad=0.5, workers=1))
+    assert summary.counts["images_used"] == 4 and summary.reasons == {"too large": 1}
+    assert 'cafe/bomb.png,.,cafe,"too large: 3,600,000,000 pixels' in (out / "report.csv").read_text()
+    (sample,) = samples(out)
+    told = json.loads(sample["json"])["images"]
+    deep = sample[f"{[image['source'] for image in told].index('cafe/deep.png')}.jpg"]
+    stored = np.asarray(Image.open(io.BytesIO(deep)).convert("L")).astype(int)
+    assert np.abs(stored - (ramp >> 8)).mean() < 3
