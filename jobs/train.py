@@ -8,13 +8,9 @@ note that `accelerate launch` itself turns any of them but 0 into 1, so `<run>/s
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 from jobs.cli import parse, run_job
-from pipeline.common.errors import UserError
 from pipeline.config import RunConfig, to_dict
 
 
@@ -41,35 +37,15 @@ def main() -> None:
         if job.dry_run:
             from pipeline.training.dry_run import preview, show
 
+            rows = preview(config)  # on all ranks: the model's forward pass has collectives
             if first:
-                print(show(preview(config)))
+                print(show(rows))
             return
-        train(config, accelerator, first)
+        from pipeline.training.trainer import train
 
-
-def train(config: RunConfig, accelerator: object, first: bool) -> None:
-    """Runs the trainer; writes `status.json` beside the checkpoints, whatever happens."""
-    from pipeline.training.trainer import Trainer
-
-    status = {"exit_code": 1, "message": "ended by an unexpected error"}
-    try:
-        outcome = Trainer(config, accelerator).fit()
-        state = outcome.state
-        message = f"{outcome.reason}: step {state.step}, epoch {state.epoch}"
-        if state.best is not None:
-            message += f", best R@5 {state.best:.2f} at step {state.best_step}"
-        status = {"exit_code": 0, "message": message}
+        outcome = train(config, accelerator)
         if first:
-            print(f"{outcome.run}: {message}", flush=True)
-    except UserError as error:
-        status = {"exit_code": error.exit_code, "message": str(error)}
-        raise
-    finally:
-        run = Path(config.output) / config.name
-        if first and run.is_dir():
-            temporary = run / f".status-{os.getpid()}"
-            temporary.write_text(json.dumps(status, indent=1) + "\n")
-            temporary.replace(run / "status.json")
+            print(f"{outcome.run}: {outcome}", flush=True)
 
 
 if __name__ == "__main__":

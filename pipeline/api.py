@@ -158,7 +158,7 @@ def train(config: RunConfig) -> Outcome:
         UsageError, DataError: the settings or the shards; Diverged: the loss is not finite.
     """
     from pipeline.training.launch import launched
-    from pipeline.training.trainer import Trainer
+    from pipeline.training.trainer import train as train_run
 
     with launched(config.train.timeout) as accelerator:
-        return Trainer(config, accelerator).fit()
+        return train_run(config, accelerator)

@@ -12,7 +12,8 @@ Shapes: `B` images in the global batch, `b = B / W` on this rank, rank r holds r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -184,6 +185,28 @@ def on_rank_0(work: Callable[[], Value], what: str = "") -> Value:
     elif problem is not None:
         raise (mine if mine is not None else problem)
     return value
+
+
+@contextmanager
+def held_on_rank_0(make: Callable[[], AbstractContextManager[Any]], what: str = "") -> Iterator[None]:
+    """Rank 0 enters the context that `make` gives (a lock); all ranks raise where it cannot. Collective."""
+    with ExitStack() as held:
+
+        def enter() -> None:
+            held.enter_context(make())
+
+        on_rank_0(enter, what)
+        yield
+
+
+def lost(error: BaseException) -> Unexpected | None:
+    """The one line for a collective that failed because another rank ended or did not answer; None for other errors."""
+    text = str(error)
+    network = isinstance(error, (dist.DistBackendError, dist.DistNetworkError, dist.DistStoreError))
+    if not is_distributed() or not isinstance(error, RuntimeError) or not (network or "gloo/transport" in text):
+        return None
+    reason = text.strip().splitlines()[0].split("] ")[-1]
+    return Unexpected(f"rank {rank()}: another rank ended or did not answer ({reason}); its own messages say why")
 
 
 def same(value: str, what: str) -> None:

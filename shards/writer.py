@@ -8,7 +8,6 @@ settings never mix into a folder.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import multiprocessing
 import os
@@ -28,7 +27,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.common.errors import DataError, UsageError
-from pipeline.common.files import write_atomically
+from pipeline.common.files import locked, write_atomically
 from pipeline.common.progress import Progress
 from pipeline.common.text import shown as readable
 from shards import groups, index, report, schema
@@ -230,11 +229,7 @@ def _begun(out: Path, settings: dict[str, Any]) -> Iterator[None]:
     """The folder of unfinished work: locked against a second run, its settings written, old temporary files gone."""
     folder = out / schema.UNFINISHED
     folder.mkdir(exist_ok=True)
-    with (folder / "lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UsageError(f"--out {out}: another run is writing there") from None
+    with locked(folder / "lock", f"--out {out}: another run is writing there"):
         for stale in folder.glob("*.tmp"):
             stale.unlink(missing_ok=True)
         if not (folder / SETTINGS).exists():

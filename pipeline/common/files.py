@@ -2,12 +2,49 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.common.errors import UsageError
 from pipeline.common.text import shown
+
+_NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
+
+
+@contextmanager
+def locked(path: Path, refusal: str = "", patience: float = 0.0) -> Iterator[None]:
+    """Holds a file's lock; the system drops it when its holder dies, however it dies.
+
+    Args:
+        path: the file, made where it is missing and left behind (removing it would let two holders in).
+        refusal: what to tell where another process holds the lock; "": wait for it.
+        patience: seconds to wait before refusing, for a holder that is just ending.
+
+    Raises:
+        UsageError: another process holds it. A file system without locks does not refuse.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    deadline = time.monotonic() + patience
+    with path.open("a") as file:
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | (fcntl.LOCK_NB if refusal else 0))
+            except BlockingIOError:
+                if time.monotonic() >= deadline:
+                    raise UsageError(refusal) from None
+                time.sleep(0.2)
+                continue
+            except OSError as error:
+                if not refusal or error.errno not in _NO_LOCKS:
+                    raise
+            break
+        yield
 
 
 def write_atomically(path: Path, data: bytes, temporary: Path | None = None) -> None:

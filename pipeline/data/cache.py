@@ -12,12 +12,12 @@ import fcntl
 import hashlib
 import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.common.errors import DataError, UsageError
+from pipeline.common.files import locked
 from pipeline.common.text import shown
 from shards.schema import is_shard_name
 
@@ -96,10 +96,11 @@ class ShardCache:
         if _touch(path):
             return path
         path.parent.mkdir(parents=True, exist_ok=True)
-        with _locked(_lock_of(path)):
+        with locked(_lock_of(path)):
             if _touch(path):  # another process was faster
                 return path
             part = path.with_name(name + ".part")
+            part.unlink(missing_ok=True)  # of a killed process: it must not take the room that is wanted for itself
             self._reserve(part, size)
             try:
                 self._copy(name, part)
@@ -137,7 +138,7 @@ class ShardCache:
     def _reserve(self, part: Path, size: int) -> None:
         """Makes room for `size` bytes and takes it with a sparse `part` of that size."""
         while True:
-            with _locked(self.base / ".lock"):
+            with locked(self.base / ".lock"):
                 used = self._drop_stale_parts()
                 if self._evict(used, size):
                     with part.open("wb") as file:
@@ -188,12 +189,3 @@ def _touch(path: Path) -> bool:
     except FileNotFoundError:
         return False
     return True
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Holds the file's lock, which the system drops when its holder dies."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield

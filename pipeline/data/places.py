@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from pipeline.common.errors import DataError, UsageError, UserError
+from pipeline.common.errors import DataError, UsageError, told
 from pipeline.config import DataConfig
 from pipeline.data import workers
 from pipeline.data.augment import Draws, check, training_view
@@ -112,9 +112,13 @@ class Places(Dataset[Batch | Failure]):
 
     def __getitems__(self, positions: list[int]) -> Batch | Failure:
         try:
-            return self.batch(positions)
-        except UserError as error:  # across processes torch would wrap it in a traceback
-            return Failure(type(error).__name__, str(error))
+            batch = self.batch(positions)
+            workers.hand_over(batch.images, batch.labels)
+            return batch
+        except Exception as error:  # across processes torch would wrap it in a traceback
+            if (mended := told(error, f"reading {self.cache.root}")) is None:
+                raise
+            return Failure(type(mended).__name__, str(mended))
 
     def batch(self, positions: list[int]) -> Batch:
         """Reads, decodes and augments places. Raises `DataError` naming shard, sample and member."""
@@ -172,7 +176,10 @@ class Places(Dataset[Batch | Failure]):
 
 
 class PlaceLoader:
-    """The rest of a plan, as this rank's batches in their order. Iterate once; `len` is what is to come."""
+    """The rest of a plan, as this rank's batches in their order. Iterate once; `len` is what is to come.
+
+    Where `stop()` becomes true while no batch comes, the batches end early.
+    """
 
     def __init__(
         self,
@@ -183,6 +190,7 @@ class PlaceLoader:
         start_step: int,
         rank: int,
         world_size: int,
+        stop: Callable[[], bool] = lambda: False,
     ) -> None:
         check(data.rand_ops, data.rand_magnitude)
         self.plan = planned
@@ -202,17 +210,15 @@ class PlaceLoader:
         self.dataset = Places(members(index, mine.reshape(-1)), self.cache, data, seed, turns)
         if self.cache.remote:
             self._check_room(data)
+        self.stop = stop
         self._loader: DataLoader[Batch | Failure] = DataLoader(
             self.dataset,
             batch_sampler=_Steps(start_step, steps, self.places),
             collate_fn=_as_is,
-            num_workers=data.workers,
-            prefetch_factor=data.prefetch if data.workers else None,
-            multiprocessing_context=workers.context() if data.workers else None,
-            worker_init_fn=workers.start_worker,
             pin_memory=torch.cuda.is_available(),
             # torch draws a seed from it that nothing here uses: the trainer's own generator stays untouched
             generator=torch.Generator(),
+            **workers.options(data.workers, data.prefetch),
         )
 
     def __len__(self) -> int:
@@ -221,16 +227,12 @@ class PlaceLoader:
     def __iter__(self) -> Iterator[Batch]:
         ahead = self._fetch_ahead() if self.cache.remote else None
         try:
-            for step, batch in enumerate(self._loader, self.start_step):
+            for step, batch in enumerate(workers.batches(self._loader, self.stop), self.start_step):
                 if isinstance(batch, Failure):
                     raise (UsageError if batch.kind == "UsageError" else DataError)(batch.message)
                 yield batch
                 if ahead is not None:
                     ahead.advance(step + 1)
-        except RuntimeError as error:
-            if "worker" in str(error):  # torch only says that a process went away
-                error.add_note("a decoding process died: out of memory, or /dev/shm is full? Lower data.workers.")
-            raise
         finally:
             self.dataset.close()
             if ahead is not None:
@@ -282,12 +284,15 @@ def build_loader(
     rank: int,
     world_size: int,
     mined: Mined | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> PlaceLoader:
     """This rank's batches of an epoch from `start_step` on; `mined`: as for `plan`.
+
+    They are fewer where `stop()` becomes true while none comes.
 
     Raises:
         UsageError: a batch that ranks cannot share equally, or too few places or too little cache for the settings.
         DataError: while iterating, a shard or member that cannot be read or decoded.
     """
     planned = plan(index, seed, epoch, data.places_per_batch, data.order, data.window_shards, mined)
-    return PlaceLoader(index, data, planned, seed, start_step, rank, world_size)
+    return PlaceLoader(index, data, planned, seed, start_step, rank, world_size, stop)

@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,8 +19,9 @@ import numpy as np
 import torch
 from torch import nn
 
+from pipeline.common.files import locked
 from pipeline.config import EvaluationConfig
-from pipeline.distributed import on_rank_0
+from pipeline.distributed import held_on_rank_0, on_rank_0, same
 from pipeline.evaluation.describe.encode import evaluating
 from pipeline.evaluation.describe.sides import Engine
 from pipeline.evaluation.protocol import Protocol, Side, protocols
@@ -90,10 +92,11 @@ def evaluate(
     if config.store != "none" and output is not None and fingerprint is None:
         fingerprint = model_fingerprint(model)
     results: list[Result] = []
-    with evaluating(model), tempfile.TemporaryDirectory() as temporary:
+    with _alone_in(output), evaluating(model), tempfile.TemporaryDirectory() as temporary:
         engine = Engine(model, config, device, output, Path(temporary), progress, fingerprint or "")
         tokens = PatchTokens(model, config, device) if config.rerank else None
         for evaluated in sets:
+            same(_names_digest(evaluated), f"the digest of the photo names of {evaluated.name}")
             chosen = protocols(config, engine.model.image_size, evaluated.rule)
             sides = {side: engine.side(evaluated, side, chosen) for side in SIDES}
             for protocol in chosen:
@@ -106,6 +109,19 @@ def evaluate(
             for side in SIDES:
                 sides[side].close()
     return results
+
+
+def _alone_in(output: Path | None) -> AbstractContextManager[None]:
+    """No second evaluation works in the folder at the same time: they would remove each other's parts."""
+    if output is None:
+        return nullcontext()
+    refusal = f"{output}: another evaluation works in it; wait for that, or give another --output"
+    return held_on_rank_0(partial(locked, output / ".lock", refusal), what=f"the results' folder {output}")
+
+
+def _names_digest(evaluated: EvaluationSet) -> str:
+    names = "\n".join(path.name for path in (*evaluated.database, *evaluated.queries))
+    return hashlib.sha256(names.encode(errors="surrogateescape")).hexdigest()[:16]
 
 
 def model_fingerprint(model: nn.Module) -> str:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import hashlib
 import json
 import shutil
@@ -30,7 +29,7 @@ import torch
 from torch import nn
 
 from pipeline.common.errors import DataError, UsageError
-from pipeline.common.files import sync_path, write_atomically
+from pipeline.common.files import locked, sync_path, write_atomically
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.describe.encode import describe_each, evaluating
 from pipeline.evaluation.protocol import Protocol, protocols
@@ -229,11 +228,7 @@ def _building(folder: Path) -> Iterator[None]:
     ):  # fmt: skip
         raise UsageError(f"{folder}: holds other things than an index; give an empty or a new folder")
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOCK).open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system drops it when its holder dies
-        except BlockingIOError:
-            raise UsageError(f"{folder}: another build works in it; wait for that, or give another folder") from None
+    with locked(folder / LOCK, f"{folder}: another build works in it; wait for that, or give another folder"):
         yield
 
 

@@ -66,7 +66,7 @@ class Runner:
         state = run / "checkpoints" / "last" / "state.json"
         if state.is_file():
             return f"interrupted at step {json.loads(state.read_text())['state']['step']:,}"
-        return "ended with an error" if ended else "to do"
+        return "ended with an error" if ended.get("exit_code") else "to do"  # none yet: killed before a checkpoint
 
     def train(self, training: Training) -> None:
         """Trains to the end, or continues, unless finished.

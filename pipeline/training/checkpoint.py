@@ -4,14 +4,16 @@
     outputs/<run>/checkpoints/last -> step-00000123      best -> step-00000100
 
 Invariant: a kill at any moment leaves the previous checkpoint readable. A folder is written under a temporary name,
-synced and renamed once; `last` and `best` are symbolic links replaced by one rename. The tensors are whole (never
-shards) and named as in the model, so any engine and any number of ranks can read what another wrote; nothing in here
-is pickled. Randomness needs no state: it is keyed by (seed, epoch, step, rank), see `trainer`.
+synced and renamed once; `last` and `best` are symbolic links replaced by one rename (small text files on a file system
+without links). The tensors are whole (never shards) and named as in the model, so any engine and any number of ranks
+can read what another wrote; nothing in here is pickled. Randomness needs no state: it is keyed by (seed, epoch, step,
+rank), see `trainer`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import os
 import shutil
@@ -23,9 +25,11 @@ from typing import Any
 from torch import Tensor
 
 from pipeline.common.errors import DataError, UsageError
-from pipeline.common.files import sync_path, usual_permissions
+from pipeline.common.files import sync_path, usual_permissions, write_atomically
 from pipeline.config import RunConfig, flatten
 from pipeline.config.setting import on_resume, present_name
+
+_NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)  # exFAT and SMB say one of these
 
 
 @dataclass
@@ -84,15 +88,19 @@ def write(
     target = folder(run, state.step)
     temporary = target.with_name(f".writing-{target.name}-{os.getpid()}")
     shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    weights(temporary / "model.safetensors")
-    save_file({k: v.contiguous() for k, v in optimizer.items()}, temporary / "optimizer.safetensors")
-    usual_permissions(temporary / "optimizer.safetensors")
-    told = {"state": dataclasses.asdict(state), "config": flatten(config)}
-    (temporary / "state.json").write_text(json.dumps(told, indent=1) + "\n")
-    for file in temporary.iterdir():
-        sync_path(file)
-    sync_path(temporary)
+    try:
+        temporary.mkdir(parents=True)
+        weights(temporary / "model.safetensors")
+        save_file({k: v.contiguous() for k, v in optimizer.items()}, temporary / "optimizer.safetensors")
+        usual_permissions(temporary / "optimizer.safetensors")
+        told = {"state": dataclasses.asdict(state), "config": flatten(config)}
+        (temporary / "state.json").write_text(json.dumps(told, indent=1) + "\n")
+        for file in temporary.iterdir():
+            sync_path(file)
+        sync_path(temporary)
+    except BaseException:  # a full disk has room again for what tells of it
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
     if target.exists():  # the same step again (an epoch's end that was also a save_every): the newer state wins
         stale = target.with_name(f".replaced-{target.name}-{os.getpid()}")
         target.rename(stale)
@@ -105,21 +113,34 @@ def write(
 
 
 def point(run: Path, name: str, target: Path) -> None:
-    """Points the link `name` ("last", "best") at a checkpoint, by one rename."""
+    """Points `name` ("last", "best") at a checkpoint by one rename: a link, or a text file where there are none."""
     link = run / "checkpoints" / name
     temporary = link.with_name(f".{name}-{os.getpid()}")
     temporary.unlink(missing_ok=True)
-    temporary.symlink_to(target.name)
+    try:
+        temporary.symlink_to(target.name)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        write_atomically(link, (target.name + "\n").encode())
+        return
     temporary.replace(link)
     sync_path(link.parent)
+
+
+def pointed(run: Path, name: str) -> Path | None:
+    """The checkpoint that "last" or "best" points at, None where it points at none."""
+    link = run / "checkpoints" / name
+    target = link.parent / link.read_text().strip() if link.is_file() else link.resolve()
+    return target if (target / "state.json").exists() else None
 
 
 def prune(run: Path, keep: int) -> None:
     """Removes all but the newest `keep` checkpoints, the one `best` points at, and left-overs of killed writes."""
     parent = run / "checkpoints"
-    kept = {parent / (parent / name).readlink() for name in ("last", "best") if (parent / name).is_symlink()}
+    kept = [found.name for name in ("last", "best") if (found := pointed(run, name)) is not None]
     steps = sorted(p for p in parent.glob("step-*") if p.is_dir())
-    for path in [p for p in steps[: max(0, len(steps) - keep)] if p not in kept]:
+    for path in [p for p in steps[: max(0, len(steps) - keep)] if p.name not in kept]:
         doomed = path.with_name(f".removing-{path.name}")  # renamed first: a half-removed folder must not look whole
         path.rename(doomed)
     for leftover in [*parent.glob(".writing-*"), *parent.glob(".removing-*"), *parent.glob(".replaced-*")]:
@@ -136,17 +157,18 @@ def find(run: Path, resume: str) -> Path | None:
     Raises:
         UsageError: "never" on a run that has checkpoints, or a path that holds none.
     """
-    last = run / "checkpoints" / "last"
+    last = pointed(run, "last")
     if resume == "never":
-        if last.exists():
+        if last is not None:
             raise UsageError(f"{run} already holds a run; choose another --name, or --train.resume auto to continue it")
         return None
     if resume == "auto":
         # between the two renames of a rewrite only the newest complete folder may be there, not the link's target
         complete = sorted((run / "checkpoints").glob("step-*/state.json"))
-        return last.resolve() if (last / "state.json").exists() else (complete[-1].parent if complete else None)
-    for path in (Path(resume), Path(resume) / "checkpoints" / "last"):
-        if (path / "state.json").exists():
+        return last if last is not None else (complete[-1].parent.resolve() if complete else None)
+    given = Path(resume)
+    for path in (given, pointed(given, "last"), pointed(given.parent.parent, given.name)):
+        if path is not None and (path / "state.json").exists():
             found = path.resolve()
             later = [p for p in (run / "checkpoints").glob("step-*") if p.name > found.name]
             if found.parent == (run / "checkpoints").resolve() and later:

@@ -15,7 +15,7 @@ from pipeline.config import RunConfig
 from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import ShardSets, open_shards
-from pipeline.distributed import world_size
+from pipeline.distributed import agreed, world_size
 from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
 from pipeline.training.mining import Mining
 from shards.index import ShardIndex
@@ -42,15 +42,15 @@ def saved_bytes(model: PlaceModel, images: int, joint: bool = False) -> int:
 
 
 def preview(config: RunConfig) -> list[tuple[str, str]]:
-    """Rows (what, value) of the plan of a run.
+    """Rows (what, value) of the plan of a run. Collective.
 
     Raises:
         UsageError, DataError: whatever would stop the run at its start.
     """
-    index = open_shards(config.data)
+    index = agreed(lambda: open_shards(config.data), what=f"reading {config.data.shards}")
     rows = _plan_rows(config, index)
     torch.manual_seed(config.seed)
-    model = build_model(config.model, config.data.image_size)
+    model = agreed(lambda: build_model(config.model, config.data.image_size), what="building the model")
     counts = parameter_counts(model)
     rows += [
         ("descriptor", f"{model.regions} regions x {model.pooling.dim} = {model.descriptor_dim} dimensions"),

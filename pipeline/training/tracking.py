@@ -55,6 +55,11 @@ def open_client(uri: str) -> Any:
 def experiment_id(client: Any, uri: str, name: str, output: str) -> str:
     """The experiment's id; it is created where it is missing, its artifacts beside a local store."""
     found = client.get_experiment_by_name(name)
+    if found is not None and found.lifecycle_stage == "deleted":
+        raise UsageError(
+            f"the MLflow experiment {name} in {uri} was deleted: bring it back (mlflow experiments restore -x "
+            f"{found.experiment_id}), or choose another --tracking.experiment"
+        )
     if found is not None:
         return str(found.experiment_id)
     local = uri.startswith("sqlite:")
@@ -74,15 +79,41 @@ class Tracker:
     def __init__(self, config: RunConfig, run_id: str = "", enabled: bool = True) -> None:
         self.config, self.run_id = config, run_id
         self._client: Any = None
+        self._pending: list[Any] = []
         if not enabled:
             return
+        from mlflow.exceptions import MlflowException
+
         self.uri = store_uri(config.tracking.uri, config.output)
         self._client = open_client(self.uri)
-        self._experiment = experiment_id(self._client, self.uri, config.tracking.experiment, config.output)
-        if run_id:
-            self._client.update_run(run_id, status="RUNNING")
-        else:
-            self._begin()
+        try:
+            self._experiment = experiment_id(self._client, self.uri, config.tracking.experiment, config.output)
+            if not self._continues(run_id):
+                self._begin()
+        except MlflowException as error:
+            raise UsageError(f"the MLflow store {self.uri} cannot be used: {str(error).splitlines()[0]}") from error
+
+    def _continues(self, run_id: str) -> bool:
+        """Whether the run goes on in its MLflow run; a record deleted by another tool does not stop a training."""
+        from mlflow.exceptions import MlflowException
+
+        if not run_id:
+            return False
+        try:
+            found = self._client.get_run(run_id)
+            reason = "was deleted" if found.info.lifecycle_stage == "deleted" else ""
+            if not reason:
+                self._client.update_run(run_id, status="RUNNING")
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+                raise
+            reason = "is no longer there"
+        if reason:
+            print(
+                f"warning: the MLflow run {run_id} {reason}; the training is recorded in a new one from here on",
+                file=sys.stderr, flush=True,
+            )  # fmt: skip
+        return not reason
 
     def _begin(self) -> None:
         from mlflow.entities import Param
@@ -109,7 +140,7 @@ class Tracker:
 
             now = int(time.time() * 1000)
             entries = [Metric(name, float(value), now, step) for name, value in values.items()]
-            self._client.log_batch(self.run_id, metrics=entries, synchronous=False)
+            self._pending.append(self._client.log_batch(self.run_id, metrics=entries, synchronous=False))
 
     def checkpoint(self, path: Path, step: int, values: dict[str, float]) -> None:
         """Registers a checkpoint folder as a logged model of the run, ranked by its validation figures."""
@@ -137,9 +168,8 @@ class Tracker:
         if self._client is None:
             return
         with self._recording("the end of the run"):
-            import mlflow
-
-            mlflow.flush_async_logging()
+            for record in self._pending:  # (MLflow's own flush opens a default store in the working directory)
+                record.wait()
             self._client.set_terminated(self.run_id, status=status)
 
     @contextmanager

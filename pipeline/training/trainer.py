@@ -8,26 +8,32 @@ repeats no place and skips none.
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import json
 import math
+import os
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pipeline.common.errors import Diverged, Preempted, UsageError
-from pipeline.config import RunConfig, to_dict
+from pipeline.common.errors import DataError, Diverged, Interrupted, Preempted, UsageError
+from pipeline.common.files import write_atomically
+from pipeline.config import RunConfig, flatten, to_dict
 from pipeline.data.cliques import Mined
 from pipeline.data.images import normalise
 from pipeline.data.places import Batch, build_loader
 from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import open_shards
-from pipeline.distributed import agree, on_rank_0, rank, world_size
+from pipeline.distributed import agree, agreed, broadcast_tensors, on_rank_0, rank, same, world_size
 from pipeline.model.cross_image import check_crossing
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.files import frozen_hash, load_trainable, save_model, saved_names
@@ -37,10 +43,11 @@ from pipeline.training.compiled import compile_backbone, uncompiled
 from pipeline.training.engines.base import Engine
 from pipeline.training.engines.build import build_engine, choose
 from pipeline.training.initialise import initialise
-from pipeline.training.launch import stop_signals
+from pipeline.training.launch import notice_of, stop_at, stop_signals
 from pipeline.training.loss import MultiSimilarityLoss
 from pipeline.training.meter import Meter
 from pipeline.training.mining import Mining
+from pipeline.training.run_folder import working_in
 from pipeline.training.schedule import build_optimizer, learning_rate
 from pipeline.training.tracking import Tracker
 from pipeline.training.validation import Validation
@@ -61,6 +68,24 @@ class Outcome:
     state: RunState
     reason: str
 
+    def __str__(self) -> str:
+        line = f"{self.reason}: step {self.state.step}, epoch {self.state.epoch}"
+        if self.state.best is not None:
+            line += f", best R@5 {self.state.best:.2f} at step {self.state.best_step}"
+        return line
+
+
+def train(config: RunConfig, accelerator: Any) -> Outcome:
+    """Trains in the run's folder, which it holds alone and whose `status.json` it keeps. Collective.
+
+    Raises:
+        UsageError: another training works in the folder, or it cannot be written; and as `Trainer`.
+    """
+    with working_in(Path(config.output) / config.name) as status:
+        outcome = Trainer(config, accelerator).fit()
+        status.message = str(outcome)
+        return outcome
+
 
 class Trainer:
     """Trains one run from its config, from the start or from its last checkpoint.
@@ -77,20 +102,34 @@ class Trainer:
         self.config, self.accelerator = config, accelerator
         self.main = rank() == 0
         self.run = Path(config.output) / config.name
-        self.index = open_shards(config.data)
+        self.tracker = Tracker(config, enabled=False)
+        self.samples: FileIO | None = None
+        self.stops: list[int] = []  # signals received
+        self.problem: Exception | None = None  # met between two exchanges of the ranks, told in the next
+
+        # what all ranks must agree on before they build anything
+        self.index = agreed(lambda: open_shards(config.data), what=f"reading {config.data.shards}")
+        same(settings_digest(config), "the digest of the settings")
+        same(self.index.digest, f"the digest of the shards {config.data.shards}")
         self.steps_per_epoch = len(self._plan(0).batches)
         check_batch(config, self.steps_per_epoch)
         self.total_steps = self.steps_per_epoch * config.train.epochs
         if config.train.steps is not None:
             self.total_steps = min(self.total_steps, config.train.steps)
 
+        # the model, from its config and the seed
         torch.manual_seed(config.seed)
-        model = build_model(config.model, config.data.image_size)
+        model = agreed(lambda: build_model(config.model, config.data.image_size), what="building the model")
         self.backbone_hash = frozen_hash(model)
+        same(self.backbone_hash, "the hash of the frozen weights")
         self.saved = frozenset(saved_names(model, config.model, everything=False))
-        self.state, optimizer = self._resume(model)
+
+        # where the run stands: its last checkpoint, or what a new model learns from images before its first step
+        self.state, optimizer, origin = self._resume(model)
         if self.state.step == 0 and not optimizer:
             initialise(model, self.index, config, accelerator.device)
+
+        # compiled, then wrapped by the engine, which takes the optimiser's tensors last
         compile_backbone(model, config, choose(config.train.engine), accelerator.device)
         self.engine: Engine = build_engine(
             config.train,
@@ -100,17 +139,21 @@ class Trainer:
             4 * config.data.places_per_batch // world_size(),
         )
         self.engine.load(optimizer, self.state.scaler)
+
         self.loss = build_loss(config, self.index).to(accelerator.device)
-        self.mining = Mining(config, self.index, self.run, self.origin) if config.data.order == "mined" else None
-        self.validation = Validation(config, accelerator.device) if config.validate.sets else None
+        self.mining = Mining(config, self.index, self.run, origin) if config.data.order == "mined" else None
+        self.validation: Validation | None = None
+        if config.validate.sets:
+            self.validation = agreed(lambda: Validation(config, accelerator.device), what="reading validate.sets")
 
     def fit(self) -> Outcome:
         """Trains to the end.
 
         Raises:
             Preempted: SIGTERM or SIGUSR1 came; the run is saved and continues with `--train.resume auto`.
+            Interrupted: Ctrl-C came; the same.
             Diverged: the loss is not finite; the last good checkpoint stays.
-            DataError: a shard or a validation image cannot be read.
+            DataError: a shard or a validation image cannot be read, a disk is full; on all ranks, whichever met it.
         """
         if self._ended():
             return Outcome(self.run, self.state, "already finished")
@@ -127,10 +170,12 @@ class Trainer:
                     self._epoch()
             status = "FINISHED"
             return Outcome(self.run, self.state, self._ended())
-        except (Preempted, KeyboardInterrupt):
+        except (Preempted, Interrupted, KeyboardInterrupt):
             status = "KILLED"
             raise
         finally:
+            if self.samples is not None:
+                self.samples.close()
             self.tracker.close(status)
 
     def _epoch(self) -> None:
@@ -144,15 +189,17 @@ class Trainer:
         if state.cursor >= self.steps_per_epoch:  # only now: until it is validated, an epoch is not over
             state.epoch, state.cursor = state.epoch + 1, 0
         self._save()
-        if not self._ended() and self._asked_to_stop():
-            raise self._preempted()
+        asked = self._exchange(self.problem)
+        if asked and not self._ended():
+            raise stop_at(asked, f"step {state.step}")
 
     def _train_epoch(self) -> None:
         """The steps that are left of the current epoch."""
         state, config = self.state, self.config
         loader = build_loader(
-            self.index, config.data, config.seed, state.epoch, state.cursor, rank(), world_size(), self._mined()
-        )
+            self.index, config.data, config.seed, state.epoch, state.cursor, rank(), world_size(), self._mined(),
+            stop=lambda: bool(self.stops),
+        )  # fmt: skip
         if loader.plan.in_cliques and self.main:
             share = 100 * loader.plan.in_cliques / loader.plan.batches.size
             print(
@@ -161,11 +208,8 @@ class Trainer:
         self.engine.model.train()
         meter = Meter(config.data.places_per_batch * 4, self.total_steps, state, enabled=self.main)
         with meter:
-            for batch in meter.wait(loader):
+            for batch in self._agreed_batches(meter.wait(loader)):
                 self._step(batch, meter)
-                if self._asked_to_stop():
-                    self._save()
-                    raise self._preempted()
                 if state.step >= self.total_steps and state.cursor < self.steps_per_epoch:
                     break  # train.steps falls inside the epoch
                 if state.step % config.train.save_every == 0 and state.cursor < self.steps_per_epoch:
@@ -182,8 +226,29 @@ class Trainer:
 
     def _stop_unsaved(self) -> None:
         """Leaves where nothing has happened since the last checkpoint."""
-        if self._asked_to_stop():
-            raise self._preempted()
+        if asked := self._exchange(self.problem):
+            raise stop_at(asked, f"step {self.state.step}")
+
+    def _agreed_batches(self, batches: Iterator[Batch]) -> Iterator[Batch]:
+        """This rank's batches. Before each, the ranks tell each other, in one exchange, what keeps them from a step: a
+        batch that cannot be read, a sample log that cannot be written, a signal (saved, and raised)."""
+        while True:
+            batch: Batch | None = None
+            problem = self.problem
+            try:
+                batch = next(batches, None)
+            except Exception as error:
+                problem = problem or error
+            if asked := self._exchange(problem):
+                self._save()
+                raise stop_at(asked, f"step {self.state.step}")
+            if batch is None:
+                return
+            yield batch
+
+    def _exchange(self, problem: Exception | None) -> int:
+        """The signal that any rank received, or 0; raises the problem of any rank on all."""
+        return agree(problem, notice_of(self.stops), what=f"step {self.state.step + 1} of {self.run}")
 
     def _step(self, batch: Batch, meter: Meter) -> None:
         state, config = self.state, self.config
@@ -203,9 +268,7 @@ class Trainer:
         self.engine.step(loss, rate)
         state.step += 1
         state.cursor += 1
-        if self.samples is not None:
-            self.samples.write(json.dumps({"step": state.step, "epoch": state.epoch, "samples": batch.keys}) + "\n")
-            self.samples.flush()
+        self._log_samples(batch.keys)
         mined = self.loss.statistics()
         meter.record(value, mined.by_pass)
         if state.step % config.train.log_every == 0 or state.step == self.total_steps:
@@ -269,47 +332,83 @@ class Trainer:
             self.tracker.checkpoint(path.resolve(), state.step, state.validated)
         checkpoint.prune(self.run, config.train.keep)
 
-    def _resume(self, model: PlaceModel) -> tuple[RunState, dict[str, Tensor]]:
-        """Where to continue, the weights put into the model; or a new run's state."""
-        path = checkpoint.find(self.run, self.config.train.resume)
-        self.origin = self.run if path is None else path.parent.parent
-        if path is None:
-            return RunState(index=self.index.digest), {}
-        if rank() == 0:
+    def _resume(self, model: PlaceModel) -> tuple[RunState, dict[str, Tensor], Path]:
+        """Where to continue, with the optimiser's tensors and the folder of the run that it comes from, the weights put
+        into the model; or a new run's state.
+
+        Rank 0 alone looks, reads and decides, and sends what it read: the others need not see the run's folder.
+        """
+        moments: dict[str, Tensor] = {}
+
+        def read() -> tuple[RunState | None, Path]:
+            path = checkpoint.find(self.run, self.config.train.resume)
+            if path is None:
+                return None, self.run
             print(f"continuing from {path}", file=sys.stderr, flush=True)
-        state, config, optimizer = checkpoint.read(path)
-        checkpoint.check_same(config, self.config, state, self.index.digest)
-        load_trainable(model, path)
-        if path.parent.parent != self.run.resolve():
-            state.run_id = ""  # branched off another run: a run of its own in MLflow
-        return state, optimizer
+            state, config, optimizer = checkpoint.read(path)
+            checkpoint.check_same(config, self.config, state, self.index.digest)
+            load_trainable(model, path)
+            moments.update(optimizer)
+            if path.parent.parent != self.run.resolve():
+                state.run_id = ""  # branched off another run: a run of its own in MLflow
+            return state, path.parent.parent
+
+        state, origin = on_rank_0(read, what=f"looking for a checkpoint of {self.run}")
+        if state is None:
+            return RunState(index=self.index.digest), {}, origin
+        tensors = model.state_dict()
+        with torch.no_grad():
+            for name, value in broadcast_tensors({name: tensors[name] for name in sorted(self.saved)}).items():
+                tensors[name].copy_(value)
+        return state, broadcast_tensors(moments), origin
 
     def _open(self) -> None:
         """The run's folder, its MLflow run and the sample log."""
         config = self.config
         note = self.run / "mlflow_run_id"
-        self.tracker = Tracker(config, enabled=False)
 
         def begin() -> None:
             self.run.mkdir(parents=True, exist_ok=True)
-            self._forget_samples()
-            (self.run / "config.json").write_text(json.dumps(to_dict(config), indent=1) + "\n")
+            for log in self.run.glob("samples.rank*.jsonl"):  # also those of a former, larger number of ranks
+                self._forget_samples(log)
+            write_atomically(self.run / "config.json", (json.dumps(to_dict(config), indent=1) + "\n").encode())
             # a run killed before its first checkpoint left its id here
             known = self.state.run_id or (note.read_text().strip() if note.exists() else "")
             self.tracker = Tracker(config, known, config.tracking.enabled)
             self.state.run_id = self.tracker.run_id
             note.write_text(self.tracker.run_id)
 
-        on_rank_0(begin, what=f"opening the run's folder {self.run}")
-        path = self.run / f"samples.rank{rank()}.jsonl"
-        self.samples = path.open("a") if config.train.log_samples else None
+        def open_log() -> None:
+            log = self.run / f"samples.rank{rank()}.jsonl"
+            log.parent.mkdir(parents=True, exist_ok=True)  # a disk of this machine alone
+            self._forget_samples(log)
+            self.samples = log.open("ab", buffering=0)
 
-    def _forget_samples(self) -> None:
-        """Drops the log of steps that a kill lost after the checkpoint: they are about to be taken again."""
-        for path in self.run.glob("samples.rank*.jsonl"):
-            whole = [line for line in path.read_text().splitlines() if line.endswith("}")]
-            kept = [line for line in whole if json.loads(line)["step"] <= self.state.step]
-            path.write_text("".join(line + "\n" for line in kept))
+        on_rank_0(begin, what=f"opening the run's folder {self.run}")
+        if config.train.log_samples:
+            agreed(open_log, what=f"opening the sample log in {self.run}")
+
+    def _forget_samples(self, log: Path) -> None:
+        """Drops what a log says of steps that a kill lost after the checkpoint: they are about to be taken again."""
+        if not log.exists():
+            return
+        before = log.read_text()
+        whole = [line for line in before.splitlines() if line.endswith("}")]
+        kept = "".join(line + "\n" for line in whole if json.loads(line)["step"] <= self.state.step)
+        if kept != before:
+            write_atomically(log, kept.encode())
+
+    def _log_samples(self, keys: list[str]) -> None:
+        """One line a step; what goes wrong is told in the ranks' next exchange, since the others are in their step."""
+        if self.samples is None or self.problem is not None:
+            return
+        told = {"step": self.state.step, "epoch": self.state.epoch, "samples": keys}
+        line = (json.dumps(told) + "\n").encode()
+        try:
+            if self.samples.write(line) != len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError as error:
+            self.problem = DataError(f"{self.samples.name}: {error.strerror}")
 
     def _ended(self) -> str:
         """Why the run is over, or ""."""
@@ -321,16 +420,19 @@ class Trainer:
             return "patience"
         return ""
 
-    def _asked_to_stop(self) -> bool:
-        return bool(agree(notice=int(bool(self.stops))))
-
-    def _preempted(self) -> Preempted:
-        number = self.stops[0] if self.stops else "on another rank"
-        return Preempted(f"signal {number}: saved step {self.state.step}; start again to continue")
-
     def _plan(self, epoch: int) -> Any:
         data = self.config.data
         return plan(self.index, self.config.seed, epoch, data.places_per_batch, data.order, data.window_shards)
+
+
+# where a machine has its files and its record: each may have places of its own
+PLACES = ("output", "data.shards", "data.cache", "model.backbone.weights", "validate.root", "tracking.uri")
+
+
+def settings_digest(config: RunConfig) -> str:
+    """Sixteen hex digits of all settings but `PLACES`."""
+    settings = {name: value for name, value in flatten(config).items() if name not in PLACES}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
 def step_seed(seed: int, step: int, r: int) -> int:

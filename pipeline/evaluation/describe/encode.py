@@ -30,6 +30,7 @@ from pipeline.common.errors import told
 from pipeline.common.files import reserve
 from pipeline.common.progress import Progress
 from pipeline.config import EvaluationConfig
+from pipeline.data import workers
 from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.describe.broken import broken_photos
 from pipeline.evaluation.protocol import Protocol, Side
@@ -81,7 +82,11 @@ class _Batches(torch.utils.data.Dataset[tuple[Tensor, list[int]]]):
                 if told(error) is None:
                     raise
                 broken.append(position)
-        return (torch.empty(0), broken) if broken else (torch.stack(images), [])
+        if broken:
+            return torch.empty(0), broken
+        batch = torch.stack(images)
+        workers.hand_over(batch)
+        return batch, []
 
 
 @dataclass
@@ -157,7 +162,7 @@ def encode(
     first = min(distributed.gather_uneven(torch.tensor([resume.done], device=device)).tolist())
     own = [batches[step * w + r] for step in range(first, steps) if step * w + r < len(batches)]
     size = int(model.image_size)  # type: ignore[arg-type]
-    loader = iter(_loader(_Batches(paths, own, size, config.resize), config.workers))
+    loader = _loader(_Batches(paths, own, size, config.resize), config.workers)
     total = sum(len(batch) for batch in batches[first * w :])
     problem: BaseException | None = None
     broken: list[int] = []
@@ -320,15 +325,12 @@ def _zeros(shape: tuple[int, ...], dtype: Any) -> Tensor:
     return torch.from_numpy(np.zeros((1, *shape), dtype))
 
 
-def _loader(dataset: _Batches, workers: int) -> torch.utils.data.DataLoader[tuple[Tensor, list[int]]]:
+def _loader(dataset: _Batches, processes: int) -> Iterator[tuple[Tensor, list[int]]]:
     """Whole batches in order. Its own generator: a validation must not advance the training's random state."""
-    workers = min(workers, len(dataset)) if len(dataset) > 1 else 0
-    return torch.utils.data.DataLoader(
-        dataset,
-        batch_size=None,
-        num_workers=workers,
-        generator=torch.Generator(),
-        prefetch_factor=2 if workers else None,
+    processes = min(processes, len(dataset)) if len(dataset) > 1 else 0
+    options = workers.options(processes, prefetch=2)
+    return workers.batches(
+        torch.utils.data.DataLoader(dataset, batch_size=None, generator=torch.Generator(), **options)
     )
 
 

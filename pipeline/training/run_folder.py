@@ -1,0 +1,159 @@
+"""A run's folder while a training works in it: its lock, and `status.json`, which says how the run stands or ended.
+
+Invariant: one training at a time works in a folder. `status.json` says "running" from the first moment, and how it
+ended afterwards; a run that was killed leaves "running" behind, and `state_of` tells the difference by the lock. The
+file has its room on the disk from the start, so that its end can be written where a full disk was the cause.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pipeline.common.errors import DataError, Diverged, Interrupted, Preempted, UsageError, UserError, told
+from pipeline.common.files import locked
+from pipeline.distributed import held_on_rank_0, lost, rank, world_size
+
+STATUS, LOCK = "status.json", ".lock"
+ROOM = 4096  # bytes of the file: a block of the disk
+ENDING = 10.0  # seconds that a former training, told to stop, may take to leave the folder
+_STATES = {Diverged: "diverged", Preempted: "preempted", Interrupted: "interrupted"}
+
+
+@dataclass
+class Status:
+    """What `status.json` holds.
+
+    Attributes:
+        state: running, done, failed, diverged, preempted or interrupted.
+        exit_code: None while it runs; a launcher may turn it into another.
+        message: for people.
+        pid: of rank 0.
+        world_size: number of processes.
+        started, ended: UTC, ISO 8601.
+    """
+
+    state: str = "running"
+    exit_code: int | None = None
+    message: str = ""
+    pid: int = 0
+    world_size: int = 1
+    started: str = ""
+    ended: str = ""
+
+    def end(self, error: BaseException | None) -> None:
+        """Fills in how it ended."""
+        self.ended = _now()
+        if error is None:
+            self.state, self.exit_code = "done", 0
+            return
+        mended = lost(error) or told(error)
+        if mended is not None:
+            self.state = _STATES.get(type(mended), "failed")
+            self.exit_code, self.message = mended.exit_code, str(mended)
+        elif isinstance(error, KeyboardInterrupt):
+            self.state, self.exit_code, self.message = "interrupted", Interrupted.exit_code, "interrupted"
+        else:
+            self.state, self.exit_code = "failed", 1
+            self.message = f"ended by an unexpected error ({type(error).__name__})"
+
+
+@contextmanager
+def working_in(run: Path) -> Iterator[Status]:
+    """Holds a run's folder, made where it is missing, and keeps its `status.json`; rank 0 writes. Collective.
+
+    Raises:
+        UsageError: another training works in it, or it cannot be written.
+    """
+    with held_on_rank_0(lambda: _held(run), what=f"opening the run's folder {run}"):
+        status = Status(pid=os.getpid(), world_size=world_size(), started=_now())
+        try:
+            yield status
+        except BaseException as error:
+            status.end(error)
+            raise
+        else:
+            status.end(None)
+        finally:
+            if rank() == 0:
+                try:
+                    _write(run / STATUS, status)
+                except OSError as error:
+                    print(f"warning: {run / STATUS} cannot be written: {error}", file=sys.stderr, flush=True)
+
+
+def read_status(run: Path) -> dict[str, Any]:
+    """What `status.json` says, {} where there is none that can be read."""
+    try:
+        found = json.loads((run / STATUS).read_text())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def state_of(run: Path) -> str:
+    """The state in `status.json`, but "killed" where it says running and nobody works there; "" where there is none."""
+    state = str(read_status(run).get("state", ""))
+    if state != "running" or not (run / LOCK).exists():
+        return state
+    try:
+        with locked(run / LOCK, "at work"):
+            return "killed"
+    except (UserError, OSError):
+        return state
+
+
+@contextmanager
+def _held(run: Path) -> Iterator[None]:
+    refusal = f"{run}: another training works in this folder; wait for it, or choose another --name"
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        lock = locked(run / LOCK, refusal, ENDING)
+        lock.__enter__()
+    except OSError as error:
+        raise _refused(run, error) from error
+    try:
+        try:
+            _write(run / STATUS, Status(pid=os.getpid(), world_size=world_size(), started=_now()))
+        except OSError as error:
+            raise _refused(run, error) from error
+        yield
+    finally:
+        lock.__exit__(None, None, None)
+
+
+def _refused(run: Path, error: OSError) -> UserError:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return DataError(f"{run}: {error.strerror}; make room, or choose another --output")
+    return UsageError(f"{run}: the run's folder cannot be written ({error.strerror}); choose another --output")
+
+
+def _write(path: Path, status: Status) -> None:
+    """Whole or not at all where the disk has room for a second file; else over the first, which has its room."""
+    text = json.dumps(asdict(status), indent=1)
+    if len(text.encode()) >= ROOM:
+        status = Status(**{**asdict(status), "message": status.message[: ROOM // 8] + " ..."})
+        text = json.dumps(asdict(status), indent=1)
+    padded = (text + "\n").encode().ljust(ROOM)
+    temporary = path.with_name(f".status-{os.getpid()}")
+    try:
+        temporary.write_bytes(padded)
+        temporary.replace(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        if not path.exists():
+            raise
+        with path.open("r+b") as file:
+            file.write(padded)
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
