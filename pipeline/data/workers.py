@@ -125,6 +125,10 @@ def batches(loader: DataLoader[Any], stop: Callable[[], bool] = lambda: False) -
         iterator = iter(loader)
     except OSError as error:  # its queues lie in /dev/shm, too
         raise DataError(f"loader workers cannot be started ({error.strerror}); {SHARED}") from error
+    except EOFError as error:
+        raise DataError(
+            "loader workers cannot be started: the process that starts them died; out of memory?"
+        ) from error
     since = time.monotonic()
     while True:
         try:
