@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from shards import index, schema
-from shards.sources.gsv_cities import _read_frame
+from shards.sources.frames import read_frame
+from shards.sources.gsv_cities import COLUMNS
 
 PLACES = 57_462  # with at least four images, of 59,342
 ROWS = 470_834
@@ -54,7 +55,9 @@ def test_all_places_of_gsv_cities(shared_dir: Path, tmp_path: Path, photo: Calla
     assert opened.table.num_rows == 2 * PLACES
     assert counts["places"] == PLACES and counts["places_under_four"] == 59_342 - PLACES
     assert counts["places_fallen"] == 0 and counts["images_bad"] == 0
-    named = Counter((row["city_id"], row["place_id"]) for frame in frames for row in _read_frame(frame).to_pylist())
+    named = Counter(
+        (row["city_id"], row["place_id"]) for frame in frames for row in read_frame(frame, COLUMNS).to_pylist()
+    )
     pairs = list(zip(opened.table["city"].to_pylist(), opened.table["place_id"].to_pylist(), strict=True))
     assert Counter(pairs) == Counter({place: 2 for place, n in named.items() if n >= 4})
     assert counts["images_named"] + counts["duplicates"] == ROWS
@@ -63,7 +66,7 @@ def test_all_places_of_gsv_cities(shared_dir: Path, tmp_path: Path, photo: Calla
 
 def _link_photos(source: Path, frame: Path) -> None:
     """A link for each row, named as the data set names its photos; extensions mixed."""
-    rows = _read_frame(frame).to_pylist()
+    rows = read_frame(frame, COLUMNS).to_pylist()
     for n, row in enumerate(rows):
         folder = source / "Images" / row["city_id"]
         if n == 0:
