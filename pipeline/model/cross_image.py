@@ -5,6 +5,9 @@ images given are one group on this rank alone. Cost a rank and layer: attention 
 gathered keys and values, one all-gather of B*R*2D numbers, one reduce-scatter of the same size backward. Images that
 attend to themselves only need no other rank; they go through the same call, so that joint training (each image in the
 global batch and alone) calls every layer once and a sharding engine gathers its parameters once.
+
+Beside a bank (evaluation) each image attends to itself and to a fixed list of M images; these attend to each other
+only, so their keys and values are constants of each layer (`remember`), and an image's output depends on no other image.
 """
 
 from __future__ import annotations
@@ -16,6 +19,10 @@ from torch import Tensor, nn
 from pipeline.common.errors import UsageError
 from pipeline.config import CrossImageConfig
 from pipeline.distributed import gather
+
+
+Memory = list[tuple[Tensor, Tensor]]
+"""Keys and values of a bank's M images in each layer, [R, heads, M, D / heads] each."""
 
 
 class CrossImageAttention(nn.Module):
@@ -44,6 +51,24 @@ class CrossImageAttention(nn.Module):
         if alone:
             attended.append(F.linear(x[together:], self.in_proj_weight[2 * dim :], self.in_proj_bias[2 * dim :]))
         out: Tensor = self.out_proj(torch.cat(attended))
+        return out
+
+    def keys_values(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """What a bank's images are to others in this layer: [M, R, D] -> keys, values [R, heads, M, D / heads]."""
+        dim = x.shape[-1]
+        key_value = F.linear(x, self.in_proj_weight[dim:], self.in_proj_bias[dim:])
+        key, value = key_value.split(dim, dim=-1)
+        return self._by_region(key), self._by_region(value)
+
+    def beside(self, x: Tensor, keys: Tensor, values: Tensor) -> Tensor:
+        """[b, R, D] -> [b, R, D]: each image over itself and over the keys and values of a bank."""
+        query, key, value = F.linear(x, self.in_proj_weight, self.in_proj_bias).chunk(3, dim=-1)
+        query, key, value = self._by_region(query), self._by_region(key), self._by_region(value)
+        itself = (query * key).sum(-1, keepdim=True)  # [R, heads, b, 1]
+        scores = torch.cat((query @ keys.transpose(-1, -2), itself), dim=-1) * query.shape[-1] ** -0.5
+        weights = scores.softmax(-1)
+        attended = weights[..., :-1] @ values + weights[..., -1:] * value
+        out: Tensor = self.out_proj(attended.permute(2, 0, 1, 3).flatten(2))
         return out
 
     def _over_all(self, x: Tensor) -> Tensor:
@@ -78,7 +103,14 @@ class CrossImageLayer(nn.Module):
 
     def forward(self, x: Tensor, alone: int = 0) -> Tensor:
         """[b, R, D] -> [b, R, D]; `alone` as in the attention."""
-        x = self.norm1(x + self.dropout(self.self_attn(x, alone)))
+        return self._after(x, self.self_attn(x, alone))
+
+    def beside(self, x: Tensor, keys: Tensor, values: Tensor) -> Tensor:
+        """[b, R, D] -> [b, R, D] beside the keys and values of a bank, as in the attention."""
+        return self._after(x, self.self_attn.beside(x, keys, values))
+
+    def _after(self, x: Tensor, attended: Tensor) -> Tensor:
+        x = self.norm1(x + self.dropout(attended))
         hidden = self.dropout(F.gelu(self.linear1(x)))
         out: Tensor = self.norm2(x + self.dropout(self.linear2(hidden)))
         return out
@@ -102,6 +134,22 @@ class CrossImageEncoder(nn.Module):
         """[b, R, D] -> [b, R, D]; `alone`: the last so many images are groups of one (the config's: all)."""
         for layer in self.layers:
             regions = layer(regions, len(regions) if self.alone else alone)
+        return regions
+
+    def remember(self, bank: Tensor) -> Memory:
+        """The keys and values of a bank [M, R, D] in each layer; its images attend to each other only. In eval mode."""
+        memory: Memory = []
+        for layer in self.layers:
+            assert isinstance(layer, CrossImageLayer)
+            memory.append(layer.self_attn.keys_values(bank))
+            bank = layer(bank)
+        return memory
+
+    def beside(self, regions: Tensor, memory: Memory) -> Tensor:
+        """[b, R, D] -> [b, R, D]: each image beside a bank, and beside no other. In eval mode."""
+        for layer, (keys, values) in zip(self.layers, memory, strict=True):
+            assert isinstance(layer, CrossImageLayer)
+            regions = layer.beside(regions, keys, values)
         return regions
 
 

@@ -3,6 +3,7 @@
 Invariant: `encode` looks at one image at a time (but for BatchNorm statistics in training), `correlate` looks
 across the images: in `train()` mode at the global batch of all ranks, in `eval()` mode at the images given, as one
 group on this rank. So the descriptor of an image depends on its group, and never on how a group is split over ranks.
+`correlate_beside` looks at one image and a bank (pipeline.model.bank): it depends on no other image at all.
 """
 
 from __future__ import annotations
@@ -17,10 +18,14 @@ from pipeline.model.aggregators import build_pooling
 from pipeline.model.backbones.resnet import ResNet, is_resnet
 from pipeline.model.backbones.transformer import Backbone
 from pipeline.model.backbones.vgg import VGG
+from pipeline.model.bank import Bank
 from pipeline.model.batch_norm import GlobalBatchNorm2d
 from pipeline.model.chunked import in_step, recomputed
-from pipeline.model.cross_image import CrossImageEncoder
+from pipeline.model.cross_image import CrossImageEncoder, Memory, check_crossing
 from pipeline.model.pooling import at_least_float32
+
+
+BESIDE = 8  # images in a call beside a bank: one alone pays for eight, which is 5 % of its way through ViT-B
 
 
 class PlaceModel(nn.Module):
@@ -34,6 +39,7 @@ class PlaceModel(nn.Module):
     """
 
     correlates_alone = True  # `correlate` knows `alone`
+    bank: Bank | None = None  # the one saved beside the weights; no part of them
 
     def __init__(self, config: ModelConfig, image_size: int) -> None:
         super().__init__()
@@ -95,6 +101,32 @@ class PlaceModel(nn.Module):
         Rows: the b images of the group (in training: of the global batch), then the same b images each alone.
         """
         return self._flat(self.cross_image(torch.cat((regions, regions)), len(regions)))
+
+    def remember(self, bank: Bank) -> Memory:
+        """The constants of `correlate_beside`: a bank's keys and values in each layer, where the model is.
+
+        Raises:
+            UsageError: the model's images do not attend to each other, or the bank is of another model's shape.
+        """
+        check_crossing(self.config.cross_image, "a bank")
+        wanted = (self.regions, self.descriptor_dim // self.regions)
+        if tuple(bank.regions.shape[1:]) != wanted:
+            raise UsageError(f"the bank's regions are {tuple(bank.regions.shape[1:])}, this model's are {wanted}")
+        parameter = next(self.parameters())
+        return self.cross_image.remember(bank.regions.to(parameter.device, parameter.dtype))
+
+    def correlate_beside(self, regions: Tensor, memory: Memory) -> Tensor:
+        """Each image beside a bank: [b, R, D] -> [b, R*D], of unit length, float32 at least.
+
+        Images go through in calls of one shape, `BESIDE` at a time, the last filled up with zeros: a matrix product may
+        round differently for another number of rows, so any other way a descriptor's last bits would depend on how
+        many images came with it.
+        """
+        found = []
+        for part in regions.split(BESIDE):
+            full = F.pad(part, (0, 0, 0, 0, 0, BESIDE - len(part)))
+            found.append(self._flat(self.cross_image.beside(full, memory))[: len(part)])
+        return torch.cat(found)
 
     def _flat(self, related: Tensor) -> Tensor:
         with torch.autocast(related.device.type, enabled=False):
