@@ -112,15 +112,19 @@ class EvaluationConfig(Settings):
     """Folder under which set names are looked up."""
     split: Literal["train", "val", "test"] = setting("test", changes="numbers")
     """Split of the folder layout."""
-    groups: tuple[Literal["single", "shuffled", "ordered"], ...] = setting(
+    groups: tuple[Literal["single", "shuffled", "ordered", "bank"], ...] = setting(
         ("single", "shuffled", "ordered"), changes="numbers"
     )
-    """Which images share an inference batch: each alone, seeded random groups, or neighbours in file order (the
-    paper's way)."""
+    """Which images share an inference batch: each alone, seeded random groups, neighbours in file order (the paper's
+    way), or each image beside a fixed bank of images (ours; docs/one_photo.md)."""
     group_size: int = setting(16, changes="numbers", at_least=1)
     """Images a group for shuffled and ordered (paper: 16; 8 on Pittsburgh)."""
     group_seed: int = setting(0, changes="numbers", at_least=0, at_most=SEEDS)
     """Seed of the shuffled grouping."""
+    bank: int = setting(64, changes="numbers", at_least=1, at_most=65_536)
+    """Images in the bank; all there are where they are fewer. Training saves a bank of so many beside its weights."""
+    bank_from: str = setting("train", changes="numbers")
+    """Whose images: train (the bank saved beside the weights), map (drawn from each set's database), or a folder."""
     recalls: tuple[int, ...] = setting((1, 5, 10, 20), changes="numbers", at_least=1, at_most=10_000)
     """The N of Recall@N."""
     radius: float = setting(25.0, changes="numbers", at_least=0, at_most=100_000)

@@ -22,6 +22,7 @@ from torch import nn
 from pipeline.common.files import locked
 from pipeline.config import EvaluationConfig
 from pipeline.distributed import held_on_rank_0, on_rank_0, same
+from pipeline.evaluation.describe.bank import chosen_bank
 from pipeline.evaluation.describe.encode import evaluating
 from pipeline.evaluation.describe.sides import Engine
 from pipeline.evaluation.protocol import Protocol, Side, protocols
@@ -97,8 +98,9 @@ def evaluate(
         tokens = PatchTokens(model, config, device) if config.rerank else None
         for evaluated in sets:
             same(_names_digest(evaluated), f"the digest of the photo names of {evaluated.name}")
-            chosen = protocols(config, engine.model.image_size, evaluated.rule)
-            sides = {side: engine.side(evaluated, side, chosen) for side in SIDES}
+            bank = chosen_bank(model, config, evaluated.database, device)
+            chosen = protocols(config, engine.model.image_size, evaluated.rule, bank)
+            sides = {side: engine.side(evaluated, side, chosen, bank) for side in SIDES}
             for protocol in chosen:
                 described = {side: sides[side].describe(protocol) for side in SIDES}
                 fitted = (projections or {}).get(protocol.grouping.name)
@@ -160,10 +162,13 @@ def fit_projections(
         query_part=None,
     )
     fitted: dict[str, Projection] = {}
-    chosen = protocols(config, model.image_size, source.rule)  # type: ignore[arg-type]
+    with evaluating(model):
+        bank = chosen_bank(model, config, source.database, device)
+    chosen = protocols(config, model.image_size, source.rule, bank)  # type: ignore[arg-type]
 
     def file(protocol: Protocol) -> Path | None:
         name = f"pca-{config.pca}{'w' if protocol.whiten else ''}.{source.name}.{protocol.grouping.name}"
+        name += protocol.bank_digest and f".{protocol.bank_digest}"
         return None if beside is None else beside / f"{name}.{fingerprint}.safetensors"
 
     def read() -> list[Protocol]:
@@ -183,7 +188,7 @@ def fit_projections(
         return fitted
     with evaluating(model), tempfile.TemporaryDirectory() as temporary:
         engine = Engine(model, config, device, None, Path(temporary), progress, "")
-        side = engine.side(sampled, "database", missing)
+        side = engine.side(sampled, "database", missing, bank)
         for protocol in missing:
             on_rank_0(partial(fit, side.describe(protocol), protocol))
         side.close()

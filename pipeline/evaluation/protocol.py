@@ -8,12 +8,14 @@ an evaluation set holds what is left over and may be short, as in the published 
 from __future__ import annotations
 
 import dataclasses
+import re
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
 from pipeline.config import EvaluationConfig
+from pipeline.model.bank import Bank
 
 Side = Literal["database", "queries"]
 
@@ -23,9 +25,10 @@ class Protocol:
     """How descriptors were computed and compared (paper, section 4.1, and the batch that its code implies)."""
 
     groups: str
-    """single: each image alone; shuffled: seeded random groups; ordered: neighbours in file order (as published)."""
+    """single: each image alone; shuffled: seeded random groups; ordered: neighbours in file order (as published);
+    bank: each image beside a fixed bank of images."""
     group_size: int
-    """Images that share one pass of the cross-image encoder; 1 for single."""
+    """Images that share one pass of the cross-image encoder; 1 for single; for bank the images of the bank."""
     group_seed: int
     """Seed of the shuffled groups; 0 and without effect otherwise."""
     image_size: int
@@ -53,12 +56,19 @@ class Protocol:
     rerank_layer: int | None = None
     """Block or stage of the backbone whose patches were matched; None: its last."""
 
+    bank_from: str = ""
+    """bank: train, map, or the folder's name."""
+    bank_digest: str = ""
+    """bank: sixteen hex digits of its regions; empty before it is known."""
+
     @property
     def name(self) -> str:
         """Short and safe in metric names, for example "shuffled16" or "ordered8_pca4096"."""
         parts = [self.groups if self.groups == "single" else f"{self.groups}{self.group_size}"]
         if self.groups == "shuffled" and self.group_seed:
             parts[0] += f"s{self.group_seed}"
+        if self.groups == "bank" and self.bank_from != "train":
+            parts[0] += re.sub(r"[^A-Za-z0-9-]", "-", self.bank_from)  # "bank64map"
         if self.pca:
             parts.append(f"pca{self.pca}{'w' if self.whiten else ''}")
         if self.resize != "antialias":
@@ -93,6 +103,7 @@ class Protocol:
             "single": "each image alone",
             "shuffled": f"random groups of {self.group_size} (seed {self.group_seed})",
             "ordered": f"groups of {self.group_size} neighbours in file order",
+            "bank": f"each image beside a bank of {self.group_size} images from {self.bank_from} ({self.bank_digest})",
         }[self.groups]
         interpolation = "antialiased" if self.resize == "antialias" else "resized after normalising, no antialias"
         pca = "no PCA"
@@ -126,16 +137,17 @@ class Protocol:
             # the raw stream of Philox is fixed for ever, where numpy's own shuffles may change between versions
             bits = np.random.Philox(key=[self.group_seed, int(side == "queries")]).random_raw(images)
             order = np.argsort(bits, kind="stable").astype(np.int64)
-        size = self.group_size * together
+        size = together if self.groups == "bank" else self.group_size * together
         return [order[first : first + size] for first in range(0, images, size)]
 
 
-def protocols(config: EvaluationConfig, image_size: int, rule: str) -> list[Protocol]:
-    """The protocols that the configuration asks for, in its order."""
+def protocols(config: EvaluationConfig, image_size: int, rule: str, bank: Bank | None = None) -> list[Protocol]:
+    """The protocols that the configuration asks for, in its order; `bank`: the one that `groups` bank is beside."""
+    sizes = {"single": 1, "bank": config.bank if bank is None else len(bank.regions)}
     return [
         Protocol(
             groups=groups,
-            group_size=1 if groups == "single" else config.group_size,
+            group_size=sizes.get(groups, config.group_size),
             group_seed=config.group_seed if groups == "shuffled" else 0,
             image_size=image_size,
             resize=config.resize,
@@ -149,6 +161,8 @@ def protocols(config: EvaluationConfig, image_size: int, rule: str) -> list[Prot
             search=config.search,
             rerank=config.rerank,
             rerank_layer=config.rerank_layer if config.rerank else None,
+            bank_from="" if groups != "bank" else config.bank_from if bank is None else bank.source,
+            bank_digest=bank.digest if groups == "bank" and bank is not None else "",
         )
         for groups in dict.fromkeys(config.groups)
     ]

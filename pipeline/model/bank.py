@@ -37,7 +37,7 @@ class Bank:
         """Sixteen hex digits of the regions."""
         values = self.regions.contiguous()
         seen = hashlib.sha256(str(tuple(values.shape)).encode())
-        seen.update(values.reshape(-1).view(torch.uint8).numpy())
+        seen.update(values.reshape(-1).view(torch.uint8).numpy().tobytes())
         return seen.hexdigest()[:16]
 
     def first(self, images: int) -> Bank:

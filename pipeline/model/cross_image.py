@@ -6,8 +6,9 @@ gathered keys and values, one all-gather of B*R*2D numbers, one reduce-scatter o
 attend to themselves only need no other rank; they go through the same call, so that joint training (each image in the
 global batch and alone) calls every layer once and a sharding engine gathers its parameters once.
 
-Beside a bank (evaluation) each image attends to itself and to a fixed list of M images; these attend to each other
-only, so their keys and values are constants of each layer (`remember`), and an image's output depends on no other image.
+Beside a bank (evaluation) each image attends to itself and to a fixed list of M images. These attend to each other
+only, so their keys and values are constants of each layer (`remember`), and an image's output depends on no other
+image.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from torch import Tensor, nn
 from pipeline.common.errors import UsageError
 from pipeline.config import CrossImageConfig
 from pipeline.distributed import gather
-
 
 Memory = list[tuple[Tensor, Tensor]]
 """Keys and values of a bank's M images in each layer, [R, heads, M, D / heads] each."""

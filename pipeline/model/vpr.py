@@ -24,7 +24,6 @@ from pipeline.model.chunked import in_step, recomputed
 from pipeline.model.cross_image import CrossImageEncoder, Memory, check_crossing
 from pipeline.model.pooling import at_least_float32
 
-
 BESIDE = 8  # images in a call beside a bank: one alone pays for eight, which is 5 % of its way through ViT-B
 
 

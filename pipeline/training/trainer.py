@@ -15,6 +15,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from io import FileIO
@@ -34,6 +35,8 @@ from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import open_shards
 from pipeline.distributed import agree, agreed, broadcast_tensors, on_rank_0, rank, same, world_size
+from pipeline.evaluation.describe.bank import TrainingBank
+from pipeline.model.bank import Bank, bank_beside, save_bank
 from pipeline.model.cross_image import check_crossing
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.files import frozen_hash, load_trainable, save_model, saved_names
@@ -145,6 +148,8 @@ class Trainer:
         self.validation: Validation | None = None
         if config.validate.sets:
             self.validation = agreed(lambda: Validation(config, accelerator.device), what="reading validate.sets")
+        self.training_bank = TrainingBank(config, self.index, accelerator.device)
+        self.bank: tuple[int, Bank | None] = (-1, None)
 
     def fit(self) -> Outcome:
         """Trains to the end.
@@ -186,6 +191,9 @@ class Trainer:
         if self.validation is not None:
             self._save()  # validation can take minutes: a kill in it must not cost the epoch
             self._validate()
+        else:
+            with self._whole():  # for the bank
+                pass
         if state.cursor >= self.steps_per_epoch:  # only now: until it is validated, an epoch is not over
             state.epoch, state.cursor = state.epoch + 1, 0
         self._save()
@@ -290,7 +298,7 @@ class Trainer:
     def _validate(self) -> None:
         """Recall of the model as it is; keeps the best, counts the epochs without a better one."""
         assert self.validation is not None
-        with self.engine.plain() as model, uncompiled(self.config.train.compile):
+        with self._whole() as model:
             values, score = self.validation.run(model, self.main)
         self.state.validated, self.state.validated_step = values, self.state.step
         self.tracker.metrics(values, self.state.step)
@@ -301,6 +309,14 @@ class Trainer:
             self.state.best, self.state.best_step, self.state.stale = score, self.state.step, 0
         else:
             self.state.stale += 1
+
+    @contextmanager
+    def _whole(self) -> Iterator[PlaceModel]:
+        """The model as it is, whole and in evaluation mode, with a bank of its own, which the next save writes."""
+        with self.engine.plain() as model, uncompiled(self.config.train.compile):
+            model.bank = self.training_bank.encode(model)
+            self.bank = (self.state.step, model.bank)
+            yield model
 
     def _save(self) -> None:
         """One checkpoint (collective): whole tensors are gathered on rank 0, which writes."""
@@ -323,6 +339,9 @@ class Trainer:
                 extra={"run": config.name, "step": state.step, "mlflow_run_id": state.run_id},
                 state=tensors, backbone_hash=self.backbone_hash,
             )  # fmt: skip
+            step, bank = self.bank
+            if bank is not None and step == state.step:
+                save_bank(bank, bank_beside(path))
 
         path = checkpoint.write(self.run, state, config, weights, optimizer)
         best = state.best_step == state.step

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pipeline import distributed
@@ -34,6 +35,7 @@ from pipeline.data import workers
 from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.describe.broken import broken_photos
 from pipeline.evaluation.protocol import Protocol, Side
+from pipeline.model.cross_image import Memory
 
 ALONE = 64  # images correlated in one call where each is a group of its own
 BLOCK_BYTES = 64 * 2**20  # descriptors handed over at once: the memory of a gather, and the size of a stored part
@@ -58,7 +60,10 @@ def blocks_of(groups: Sequence[np.ndarray], dim: int, limit: int = BLOCK_BYTES) 
 
 def calls_of(protocol: Protocol, images: int, side: Side, model: Any) -> tuple[list[np.ndarray], bool]:
     """(What is correlated in a call, whether its images are groups of one each): the groups, one a call; but of groups
-    of one image `ALONE` together, where the model can. Cut by position, so the number of processes changes nothing."""
+    of one image `ALONE` together, where the model can. Cut by position, so the number of processes changes nothing.
+    Images beside a bank are in no group: `ALONE` are handed over together."""
+    if protocol.groups == "bank":
+        return protocol.form(images, side, ALONE), False
     if protocol.group_size > 1 or not getattr(model, "correlates_alone", False):
         return protocol.form(images, side), False
     return protocol.form(images, side, ALONE), True
@@ -134,6 +139,7 @@ def encode(
     key: str = "",
     progress: bool = True,
     beyond: Sequence[Path] = (),
+    fixed: bool = False,
 ) -> Regions:
     """Runs the per-image part over `paths`, each once. Collective.
 
@@ -141,6 +147,7 @@ def encode(
         model: has `encode(images [b, 3, S, S]) -> [b, R, D]`, `regions`, `descriptor_dim` and `image_size`.
         wanted: for each grouping, the blocks that will be correlated; a rank keeps what its groups in them need.
         scratch: folder for the regions of sets too large for memory; None: memory alone.
+        fixed: fill the last forward batch up, so that all have `config.batch` images and none rounds otherwise.
         key: what the regions depend on; a file in `scratch` left by a killed run with the same key is continued.
 
         beyond: photos that will be described next; where one of `paths` is broken, these are looked through too.
@@ -174,8 +181,10 @@ def encode(
                 images, broken, problem = _next(loader)
             if distributed.agree(problem, notice=len(broken), what=label):
                 break
-            encoded = _forward(model.encode, images, config, device, dtype)  # type: ignore[arg-type]
-            gathered = distributed.gather_uneven(encoded if r < len(dealt) else encoded[:0])
+            if fixed:
+                images = F.pad(images, (0, 0, 0, 0, 0, 0, 0, config.batch - len(images)))
+            encoded = encode_batch(model.encode, images, config, device, dtype)  # type: ignore[arg-type]
+            gathered = distributed.gather_uneven(encoded[: len(dealt[r]) if r < len(dealt) else 0])
             try:
                 regions.put(np.concatenate(dealt), gathered.cpu().numpy())
                 resume.advance(step + 1, values, final=step + 1 == steps)
@@ -221,7 +230,7 @@ def describe_alone(model: nn.Module, photo: Path, resize: Any, precision: Any, d
     """
     images = to_input(load_image(photo), int(model.image_size), resize)[None]  # type: ignore[arg-type]
     config = EvaluationConfig(precision=precision)
-    regions = _forward(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
+    regions = encode_batch(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
     described: np.ndarray = model.correlate(regions).float().cpu().numpy()  # type: ignore[operator]
     return described
 
@@ -249,7 +258,7 @@ def describe_each(
             if broken:
                 found = _broken(label, broken, left, iter(()), len(paths), progress)
                 raise broken_photos(paths, found, label)
-            regions = _forward(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
+            regions = encode_batch(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
             if together and len(batch) > 1:
                 described = model.correlate(regions, alone=True)  # type: ignore[operator]
             else:
@@ -268,6 +277,7 @@ def correlate(
     label: str = "correlating",
     progress: bool = True,
     alone: bool = False,
+    memory: Memory | None = None,
 ) -> None:
     """Runs the cross-image encoder over groups. Collective.
 
@@ -276,12 +286,16 @@ def correlate(
         keep: called on rank 0 alone with (number of the block, positions [n], descriptors [n, dim]).
         done: numbers of blocks that are stored already; the same on all ranks.
         alone: the blocks' "groups" are calls of many groups of one image each (`calls_of`).
+        memory: of a bank (`PlaceModel.remember`), beside which each image is described instead of in a group.
     """
     w, r = distributed.world_size(), distributed.rank()
     todo = [number for number in range(len(blocks)) if number not in done]
     total = sum(len(group) for number in todo for group in blocks[number])
     shape = regions.values.shape[1:]
-    together = {"alone": True} if alone else {}
+    whole: Any = model
+    describe: Callable[[Tensor], Tensor] = partial(whole.correlate, alone=True) if alone else whole.correlate
+    if memory is not None:
+        describe = partial(whole.correlate_beside, memory=memory)
     with Progress(label, total, "images", enabled=progress and r == 0 and total >= TOLD) as bar:
         for number in todo:
             block = blocks[number]
@@ -289,7 +303,7 @@ def correlate(
             for call in range(-(-len(block) // w)):
                 j = call * w + r
                 group = regions.take(block[j]) if j < len(block) else _zeros(shape, regions.values.dtype)
-                described = model.correlate(group.to(device), **together)  # type: ignore[operator]
+                described = describe(group.to(device))
                 own.append(described if j < len(block) else described[:0])
             gathered = distributed.gather_uneven(torch.cat(own))
             order = np.concatenate([block[j] for rank in range(w) for j in range(rank, len(block), w)])
@@ -297,7 +311,7 @@ def correlate(
             bar.advance(sum(len(group) for group in block))
 
 
-def _forward(
+def encode_batch(
     encode: Callable[[Tensor], Tensor], images: Tensor, config: EvaluationConfig, device: torch.device, dtype: Any
 ) -> Tensor:
     """Normalised on the device where the loader left bytes; regions in the type they are kept in."""

@@ -26,6 +26,8 @@ from pipeline.evaluation.describe.store import DescriptorStore, StoreKey, StoreW
 from pipeline.evaluation.protocol import Protocol, Side
 from pipeline.evaluation.search.exact import Blocks, slices
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
+from pipeline.model.bank import Bank
+from pipeline.model.cross_image import Memory
 
 IN_MEMORY = 8 * 2**30  # bytes of one side's descriptors that rank 0 holds in memory; larger ones lie in a file
 
@@ -44,8 +46,13 @@ class Engine:
     progress: bool
     fingerprint: str
 
-    def side(self, evaluated: EvaluationSet, side: Side, chosen: Sequence[Protocol]) -> DescribedSide:
-        """Encodes one side of a set, unless the store holds all of it under the `chosen` protocols."""
+    def side(
+        self, evaluated: EvaluationSet, side: Side, chosen: Sequence[Protocol], bank: Bank | None = None
+    ) -> DescribedSide:
+        """Encodes one side of a set, unless the store holds all of it under the `chosen` protocols.
+
+        `bank`: the one of the protocol of groups `bank`, where there is one among them.
+        """
         paths = evaluated.database if side == "database" else evaluated.queries
         dim = int(self.model.descriptor_dim)
         calls = {p: calls_of(p, len(paths), side, self.model) for p in chosen}
@@ -76,10 +83,12 @@ class Engine:
                 f"{self.fingerprint} {files} {[p.grouping.name for p in missing]}" if self.fingerprint else "",
                 self.progress,
                 evaluated.queries if side == "database" else (),
+                any(p.groups == "bank" for p in missing),
             )
         alone = {p: together for p, (_, together) in calls.items()}
         label = f"{evaluated.name} {side}"
-        return DescribedSide(self, label, len(paths), blocks, alone, writers, done, regions, scratch)
+        memory = None if bank is None else self.model.remember(bank)
+        return DescribedSide(self, label, len(paths), blocks, alone, writers, done, regions, scratch, memory)
 
     def _writer(self, evaluated: EvaluationSet, side: Side, protocol: Protocol, files: str, parts: int) -> StoreWriter:
         of_database = side == "database"
@@ -112,6 +121,8 @@ class DescribedSide:
     """Parts that the store held before; the same on all ranks."""
     regions: Regions | None
     scratch: Path
+    memory: Memory | None = None
+    """Of the bank."""
 
     def describe(self, protocol: Protocol) -> Blocks | None:
         """The descriptors under one protocol, as blocks on rank 0, None elsewhere. Collective."""
@@ -129,6 +140,7 @@ class DescribedSide:
                 f"{self.label}: {protocol.grouping.name}",
                 self.engine.progress,
                 self.alone[protocol],
+                self.memory if protocol.groups == "bank" else None,
             )
         if writer is not None:
             return DescriptorStore(writer.folder).blocks

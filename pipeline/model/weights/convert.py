@@ -18,6 +18,7 @@ from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import usual_permissions
 from pipeline.config import BackboneConfig, ModelConfig
 from pipeline.model.backbones.transformer import SIZES
+from pipeline.model.bank import bank_beside, save_bank
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.files import (
     PUBLISHED_SIZE,
@@ -130,7 +131,7 @@ def _with_backbone(config: ModelConfig, weights: str) -> ModelConfig:
 
 
 def write_model(model: PlaceModel, path: Path, source: str) -> None:
-    """One safetensors file with every tensor and the config, to be loaded by `load_model` alone.
+    """One safetensors file with every tensor and the config, to be loaded by `load_model`; its bank in another beside.
 
     Metadata kept of a training checkpoint (its run, its step) goes along.
     """
@@ -139,6 +140,10 @@ def write_model(model: PlaceModel, path: Path, source: str) -> None:
         extra = read_metadata(checkpoint_file(source))["extra"] | extra
     config = dataclasses.replace(model.config, backbone=dataclasses.replace(model.config.backbone, weights=None))
     save_model(model, path, config, model.image_size, everything=True, extra=extra)
+    if model.bank is not None:
+        save_bank(model.bank, bank_beside(path))
+    else:
+        bank_beside(path).unlink(missing_ok=True)  # of other weights, which this file has replaced
 
 
 def write_published(model: PlaceModel, path: Path) -> None:

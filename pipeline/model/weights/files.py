@@ -20,6 +20,7 @@ from torch import Tensor
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import usual_permissions
 from pipeline.config import ModelConfig, from_dict, to_dict
+from pipeline.model.bank import bank_beside, read_bank
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.foreign import check_file, message
 from pipeline.model.weights.names import fit, layout, to_published
@@ -203,6 +204,7 @@ def load_model(path: str | Path, device: torch.device | str = "cpu") -> PlaceMod
     else:
         model = build_model(config, metadata["image_size"])
         load_trainable(model, file)
+    model.bank = read_bank(bank_beside(file))
     return model.to(device).eval()
 
 
