@@ -221,9 +221,12 @@ def test_zero_gradients_in_float32(engine: str, train: str, truth: dict[str, tor
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ["zero1", "zero2", "zero3"])
 def test_joint_training_under_zero(engine: str, joint_truth: dict[str, torch.Tensor], tmp_path: Path) -> None:
-    difference = compare(joint_truth, measured(engine, 2, "float32", tmp_path, "--passes", "joint"))
+    """Weights against one process in float32: in the third step a pair at mining's threshold falls to another side than
+    in float64, on one process too (1.2e-4 of what the steps moved)."""
+    found = measured(engine, 2, "float32", tmp_path, "--passes", "joint")
+    difference = compare(joint_truth, found)
     assert difference.gradient < 1e-4, difference.tensor
-    assert difference.weight < 1e-5
+    assert compare(measured("ddp", 1, "float32", tmp_path, "--passes", "joint"), found).weight < 1e-5
 
 
 @pytest.mark.slow
