@@ -107,7 +107,8 @@ def _line(got: Measured) -> str:
 
 
 def _search(kind: str, database: str, queries: str, dim: int, ks: tuple[int, ...]) -> str:
-    from pipeline.evaluation.search.exact import agreement, build_index, index_bytes, search, search_index, slices
+    from pipeline.evaluation.search.approximate import agreement, build_index, index_bytes, search_index
+    from pipeline.evaluation.search.exact import search, slices
 
     rows = np.memmap(database, np.float32, "r").reshape(-1, dim)
     asked = np.fromfile(queries, np.float32).reshape(-1, dim)

@@ -27,16 +27,8 @@ from pipeline.evaluation.describe.encode import evaluating
 from pipeline.evaluation.describe.sides import Engine
 from pipeline.evaluation.protocol import Protocol, Side, protocols
 from pipeline.evaluation.recall import recall_at
-from pipeline.evaluation.search.exact import (
-    Blocks,
-    agreement,
-    batches,
-    build_index,
-    index_bytes,
-    search,
-    search_index,
-    search_within,
-)
+from pipeline.evaluation.search.approximate import agreement, build_index, index_bytes, search_index
+from pipeline.evaluation.search.exact import Blocks, batches, search, search_within
 from pipeline.evaluation.search.projection import Projection, fit_rows, load_projection, projected, sample_rows
 from pipeline.evaluation.search.rerank import PatchTokens, rerank
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet

@@ -19,7 +19,7 @@ from pipeline.common.errors import DataError
 from pipeline.common.progress import track
 from pipeline.evaluation.describe.broken import broken_photos, problem_of
 from pipeline.evaluation.describe.encode import describe_alone, evaluating
-from pipeline.evaluation.search.exact import search_index
+from pipeline.evaluation.search.approximate import search_index
 from pipeline.evaluation.sets.utm import WIDEST, meridian_offset, metres_between, to_utm
 from pipeline.locate.gps import gps_position
 from pipeline.locate.photo_index import PhotoIndex

@@ -33,7 +33,7 @@ from pipeline.common.files import locked, sync_path, write_atomically
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.describe.encode import describe_each, evaluating
 from pipeline.evaluation.protocol import Protocol, protocols
-from pipeline.evaluation.search.exact import build_index, load_index, save_index
+from pipeline.evaluation.search.approximate import build_index, load_index, save_index
 from pipeline.evaluation.search.projection import Projection, fit_rows, load_projection, projected, sample_rows
 from pipeline.locate.descriptor_cache import KeptDescriptors
 from pipeline.locate.photos import Photos, find_photos

@@ -33,7 +33,6 @@ from pipeline.evaluation.report.figures import (
 )
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.paper.place_features import Features
-from pipeline.paper.tsne import tsne
 
 MARKERS = "osD^vP*X"
 HUES = ("#3b6fb6", "#e08214", "#1a9850", "#8e5ba6", "#17a2b8", "#b5651d", "#d6518f", "#7a8b2a", "#5f6b7a")
@@ -81,6 +80,23 @@ def _scale(figure: Any, left: float, width: float, height: float) -> None:
     figure.text((left + 1.58) / width, 0.2 / height, "low to high channel mean", fontsize=8, color=GREY, va="center")
 
 
+def tsne(points: np.ndarray, perplexity: float) -> np.ndarray:
+    """The t-SNE map [n, 2] of points [n, d] (some hundreds), by scikit-learn's exact method, started from PCA.
+
+    The same points give the same map. Neighbourhoods mean something, distances between clusters and sizes do not.
+
+    Raises:
+        UsageError: fewer than three times the perplexity of points.
+    """
+    if not 1 <= perplexity <= len(points) / 3:
+        least = int(3 * max(perplexity, 1))
+        raise UsageError(f"perplexity {perplexity:g} wants at least {least} photos, there are {len(points)}")
+    from sklearn.manifold import TSNE
+
+    method = TSNE(perplexity=perplexity, method="exact", init="pca", random_state=0, n_jobs=1)
+    return np.asarray(method.fit_transform(np.asarray(points, np.float64)))
+
+
 def place_maps(
     found: Sequence[Features], labels: np.ndarray, path: Path, below: str, perplexity: float = 30.0
 ) -> list[float]:
@@ -99,7 +115,7 @@ def place_maps(
         figure.text(0.15 / width, 1 - 0.12 / height, title, fontsize=14, weight="bold", va="top")
         figure.text(0.15 / width, 1 - 0.42 / height, below, fontsize=8.5, color=GREY, va="top")
         for number, stage in enumerate(found):
-            positions, _ = tsne(stage.values, perplexity)
+            positions = tsne(stage.values, perplexity)
             same = stage.same_place(labels)
             shares.append(100.0 * float(same.mean()))
             left = 0.15 + 4.1 * number

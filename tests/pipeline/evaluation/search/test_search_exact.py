@@ -10,17 +10,15 @@ from PIL import Image
 
 from pipeline.common.errors import DataError
 from pipeline.evaluation.recall import recall_at
-from pipeline.evaluation.search.exact import (
+from pipeline.evaluation.search.approximate import (
     agreement,
     build_index,
     index_bytes,
     load_index,
     save_index,
-    search,
     search_index,
-    search_within,
-    slices,
 )
+from pipeline.evaluation.search.exact import search, search_within, slices
 
 
 def descriptors(n: int, dim: int = 16, seed: int = 0, clusters: int = 20) -> np.ndarray:
