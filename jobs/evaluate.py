@@ -18,6 +18,7 @@ import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 from jobs.cli import parse, run_job
 from pipeline.common.errors import UsageError
@@ -37,6 +38,8 @@ class EvaluateJob(EvaluationConfig):
     """Record the recalls in the checkpoint's MLflow run, where it has one."""
     figures: bool = True
     """Draw figures and the HTML report."""
+    figures_also: tuple[Literal["pdf", "svg", "png"], ...] = ()
+    """Every figure in these formats as well, for a paper: pdf and svg hold vectors, photos and png have 300 dpi."""
     timeout: float = 1800.0
     """Seconds that a process waits for the others."""
     from_store: str | None = None
@@ -71,7 +74,10 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     from pipeline.distributed import on_rank_0
     from pipeline.evaluation.evaluate import evaluate, fit_projections, model_fingerprint
     from pipeline.evaluation.predictions import save_results
-    from pipeline.evaluation.report import html, tables
+    from pipeline.evaluation.report import tables
+    from pipeline.evaluation.report.figures import also_as
+    from pipeline.evaluation.report.page import write_page
+    from pipeline.evaluation.report.pictures import draw
     from pipeline.evaluation.sets.load import available, load_set, load_sets
     from pipeline.model.weights.files import checkpoint_file, read_metadata
     from pipeline.model.weights.load import load_any
@@ -99,10 +105,11 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     plain = {**about, "model": to_dict(model.config), "evaluation": to_dict(config), "left_out": left_out}
     save_results(results, sets, output, plain)
     if job.figures:
-        pictures = html.draw(results, sets, output / "figures", model)
+        with also_as(job.figures_also):
+            pictures = draw(results, sets, output / "figures", model)
         facts = {key: str(value) for key, value in about.items()}
         title = f"Evaluation of {(runs[0] if runs else file).name}"
-        html.write_report(results, pictures, output / "report.html", title, facts)
+        write_page(results, pictures, output / "report.html", title, facts)
     if job.track and runs:
         from pipeline.training.tracking import record_evaluation
 

@@ -31,7 +31,8 @@ class FiguresJob(EvaluationConfig):
     kind: Literal["attention", "tsne", "qualitative", "parameters"] = "parameters"
     """Which figure."""
     to: str = ""
-    """File to write: .png or .jpg; .md for the parameters."""
+    """File to write: .png or .jpg at 110 dpi, .pdf or .svg for a paper (vectors, photos at 300 dpi); .md for the
+    parameters."""
     groups: tuple[Literal["single", "shuffled", "ordered"], ...] = ("shuffled",)
     """How images share the cross-image encoder; the first counts."""
     checkpoint: str = ""
@@ -60,7 +61,7 @@ class FiguresJob(EvaluationConfig):
 def main() -> None:
     """Parses and draws."""
     job = parse(FiguresJob, __doc__ or "")
-    endings = (".md",) if job.kind == "parameters" else (".png", ".jpg")
+    endings = (".md",) if job.kind == "parameters" else (".png", ".jpg", ".pdf", ".svg")
     if (job.to and Path(job.to).suffix not in endings) or (not job.to and job.kind != "parameters"):
         raise UsageError(f"--to '{job.to}': a file ending in {' or '.join(endings)} is wanted")
     if job.kind == "parameters":

@@ -1,7 +1,8 @@
 """The figure of a table: bars for rows that are names, lines for rows that are numbers; ours and the paper's.
 
 Invariant: a panel is one set, its protocols in its legend; bars and lines are means over seeds, the dots on bars and
-the bars on lines are the seeds and their standard deviation; the paper's figures are hollow, and named with their set.
+the bars on lines are the seeds and their standard deviation; the
+paper's figures are hollow, and drawn only where they are for the same set.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.evaluation.protocol import Protocol
-from pipeline.evaluation.report.figures import CURVES, DPI, GREY, INK, STYLE
+from pipeline.evaluation.report.figures import CURVES, GREY, INK, canvas
 from pipeline.evaluation.report.paper_numbers import Reported
+from pipeline.evaluation.sets.registry import published_name
 from pipeline.paper import values
 from pipeline.paper.study import Study
 
@@ -21,15 +23,9 @@ COLOURS = dict(zip(("single", "shuffled", "ordered"), CURVES, strict=False))
 
 def draw(study: Study, path: Path) -> None:
     """Recall@1 of every row, a panel a set, to `path`."""
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     lines = bool(study.table.axis)
     height = 4.4 if lines else 1.5 + 0.62 * len(study.table.rows)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(1.0 + 5.6 * len(study.sets), height), layout="constrained")
-        FigureCanvasAgg(figure)
+    with canvas(1.0 + 5.6 * len(study.sets), height, path) as figure:
         figure.suptitle(study.table.title, x=0.01, ha="left", fontsize=13, fontweight="bold")
         panels = figure.subplots(1, len(study.sets), squeeze=False, sharey=not lines)[0]
         for panel, set_name in zip(panels, study.sets, strict=True):
@@ -40,7 +36,6 @@ def draw(study: Study, path: Path) -> None:
         figure.legend(
             [handles[label] for label in names], names, loc="outside lower center", ncols=4, fontsize=8.5, frameon=False
         )
-        figure.savefig(path, dpi=DPI)
 
 
 def _bars(panel: Any, study: Study, set_name: str) -> None:
@@ -63,7 +58,7 @@ def _bars(panel: Any, study: Study, set_name: str) -> None:
             panel.annotate(
                 f"{found.mean:.1f}", (end, y), (5, 0), textcoords="offset points", va="center", fontsize=7.5, color=GREY
             )
-        figure = values.paper_figure(study, row, loaded)
+        figure = values.paper_figure(study, row, loaded) if _of_this_set(study, set_name) else None
         if figure is not None and figure.at(1) is not None:
             style = {"s": 46, "marker": "D", "facecolor": "white", "edgecolor": INK, "lw": 1.3, "zorder": 4}
             panel.scatter(figure.at(1), place, label=_theirs(study, set_name), **style)
@@ -95,7 +90,7 @@ def _lines(panel: Any, study: Study, set_name: str) -> None:
                 label = _label(g, protocols) + named
                 panel.errorbar(x, mean, deviation if any(deviation) else None, color=colour, label=label, **style)
         theirs = _points(rows, lambda row: values.paper_figure(study, row, loaded))
-        if theirs:
+        if theirs and _of_this_set(study, set_name):
             label = _theirs(study, set_name) + named
             dashed = {"ls": "--", "marker": "os"[number % 2], "ms": 5, "mfc": "white", "color": INK, "lw": 1.2}
             panel.plot(*zip(*theirs, strict=True), label=label, **dashed)
@@ -132,6 +127,12 @@ def _label(grouping: str, protocols: Mapping[str, Mapping[str, Protocol]]) -> st
 
 def _theirs(study: Study, set_name: str) -> str:
     return f"paper, {values.paper_set(study, study.sets[set_name])}, ordered"
+
+
+def _of_this_set(study: Study, set_name: str) -> bool:
+    """Whether the paper has figures for this very set: those for other photographs do not belong on its axes."""
+    loaded = study.sets[set_name]
+    return values.paper_set(study, loaded) == (published_name(loaded.name) or loaded.name)
 
 
 def _lighter(colour: str) -> Any:

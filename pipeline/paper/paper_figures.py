@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from pipeline.common.errors import UsageError
-from pipeline.data.images import load_image, to_input
 from pipeline.evaluation.evaluate import Result
 from pipeline.evaluation.recall import first_hits
 from pipeline.evaluation.report.figures import (
@@ -23,13 +22,15 @@ from pipeline.evaluation.report.figures import (
     INK,
     RED,
     TILE,
-    _aspect,
-    _correct,
-    _metres,
-    _photo,
-    _short,
     canvas,
     caption,
+    is_right,
+    lay_over,
+    metres_text,
+    photo_tile,
+    short_name,
+    squared,
+    usual_aspect,
 )
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.paper.place_features import Features
@@ -46,7 +47,7 @@ def attention_comparison(
     Each map is spread over its own range, 2nd to 98th percentile, so colours compare within a picture alone. Photos
     are squared as the model sees them.
     """
-    wide, gap, left, head, foot = 1.9, 0.07, 0.34, 0.82, 0.36
+    wide, gap, left, head, foot = 1.9, 0.07, 0.34, 0.94, 0.36
     rows = 1 + len(maps)
     width, height = left + len(photos) * (wide + gap) + 0.1, head + rows * (wide + gap) + foot
     with canvas(width, height, path, layout="none") as figure:
@@ -56,8 +57,11 @@ def attention_comparison(
             middle = 1 - (head + row * (wide + gap) + wide / 2) / height
             figure.text(0.17 / width, middle, title, rotation=90, ha="center", va="center", fontsize=10.5)
         for column, photo in enumerate(photos):
-            pixels = to_input(load_image(photo), max(size, 224)).permute(1, 2, 0).numpy()
+            pixels = squared(photo, size)
             faded = np.repeat(pixels.mean(2, keepdims=True), 3, axis=2) / 255 * 0.75
+            name = short_name(photo, 30)
+            middle = left + column * (wide + gap) + wide / 2
+            figure.text(middle / width, 1 - (head - 0.05) / height, name, fontsize=7.5, color=GREY, ha="center")
             for row in range(rows):
                 x, y = left + column * (wide + gap), head + row * (wide + gap) + wide
                 axes = figure.add_axes((x / width, 1 - y / height, wide / width, wide / height))
@@ -67,9 +71,7 @@ def attention_comparison(
                     continue
                 heat = maps[row - 1][1][column]
                 low, high = np.percentile(heat, (2, 98))
-                frame: Any = {"extent": (0, size, size, 0), "interpolation": "bicubic", "cmap": "inferno"}
-                axes.imshow(faded)
-                axes.imshow(heat, alpha=0.62, vmin=low, vmax=high, **frame)
+                lay_over(axes, faded, heat, alpha=0.62, vmin=low, vmax=high)
         _scale(figure, left, width, height)
 
 
@@ -173,8 +175,8 @@ def retrieval_comparison(
         raise UsageError(f"{evaluated.name}: '{name}' and '{other}' are right and wrong on the same queries")
     reverse = min(len(found.baseline), max(round(count * len(found.baseline) / both), int(len(found.baseline) > 0)))
     rows = [*_spread(found.ours, max(count - reverse, int(len(found.ours) > 0))), *_spread(found.baseline, reverse)]
-    tile = (TILE, round(TILE / _aspect([evaluated.queries[q] for q in rows])))
-    wide, gap, label, head = 2.2, 0.16, 0.44, 1.3
+    tile = (TILE, round(TILE / usual_aspect([evaluated.queries[q] for q in rows])))
+    wide, gap, label, head = 2.2, 0.16, 0.56, 1.3
     high = wide * tile[1] / tile[0]
     width, height = gap + (1 + len(results)) * (wide + gap), head + len(rows) * (high + label)
     width = max(width, 7.2)
@@ -193,13 +195,14 @@ def retrieval_comparison(
                 at = gap + column * (wide + gap)
                 axes = figure.add_axes((at / width, 1 - (top + high) / height, wide / width, high / height))
                 if result is None:
-                    _photo(axes, evaluated.queries[query], tile, INK, "query", _short(evaluated.queries[query]))
+                    photo_tile(axes, evaluated.queries[query], tile, INK, "query", short_name(evaluated.queries[query]))
                     continue
                 answer = int(result.predictions[query, 0])
-                right = _correct(evaluated, result, query, 0)
+                right = is_right(evaluated, result, query, 0)
                 text = f"{'✓' if right else '✗'} {results[column - 1][0]}"
-                note = f"{_metres(evaluated, query, answer)}d² {result.distances[query, 0]:.3f}"
-                _photo(axes, evaluated.database[answer], tile, GREEN if right else RED, text, note)
+                note = f"{metres_text(evaluated, query, answer)}d² {result.distances[query, 0]:.3f}"
+                note += f"\n{short_name(evaluated.database[answer])}"
+                photo_tile(axes, evaluated.database[answer], tile, GREEN if right else RED, text, note)
     return found
 
 

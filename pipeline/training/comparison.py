@@ -156,35 +156,39 @@ def draw_curves(runs: Sequence[Run], path: Path) -> bool:
                 progress.setdefault(title, {})[run.name] = points
     if not panels and not progress:
         return False
-    import matplotlib
+    from pipeline.evaluation.report.figures import CURVES, canvas
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    total = len(panels) + len(progress)
-    columns = min(total, 4)
-    rows = -(-total // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(3.6 * columns, 3.2 * rows), squeeze=False, layout="constrained")
-    colours = {run.name: f"C{i}" for i, run in enumerate(runs)}
-    spots = list(axes.flat)
-    for axis, (title, lines, label) in zip(
-        spots,
-        [(t, c, "N database images retrieved") for t, c in sorted(panels.items())]
-        + [(t, c, "step") for t, c in sorted(progress.items())],
-        strict=False,
-    ):
-        for name, points in lines.items():
-            points = sorted(points)
-            axis.plot(*zip(*points, strict=True), marker="o", markersize=4, color=colours[name], label=name)
-        if label.startswith("N"):
-            axis.set_xticks(sorted({k for points in lines.values() for k, _ in points}))
-        axis.set(title=title, xlabel=label, ylabel="recall, %", ylim=(0, 102))
-        axis.title.set_fontsize(10)
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
-    for axis in spots[total:]:
-        axis.set_visible(False)
-    spots[0].legend(frameon=False, fontsize=9, loc="lower right")
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    drawn = [(t, c, "N, answers looked at") for t, c in _collapsed(panels).items()]
+    drawn += [(t, c, "step") for t, c in _collapsed(progress).items()]
+    columns = min(len(drawn), 3)
+    rows = -(-len(drawn) // columns)
+    colours = {run.name: CURVES[i % len(CURVES)] for i, run in enumerate(runs)}
+    markers = {run.name: "osD^vP*X"[i % 8] for i, run in enumerate(runs)}
+    with canvas(0.4 + 4.1 * columns, 0.7 + 3.1 * rows, path) as figure:
+        figure.suptitle("Recall of the runs", x=0.01, ha="left", fontsize=14, fontweight="bold")
+        axes = figure.subplots(rows, columns, squeeze=False)
+        for number, (axis, (title, lines, label)) in enumerate(zip(axes.flat, drawn, strict=False)):
+            for name, points in lines.items():
+                style = {"color": colours[name], "marker": markers[name], "ms": 4, "lw": 1.8}
+                axis.plot(*zip(*sorted(points), strict=True), label=name, **style)
+            if label.startswith("N"):
+                axis.set_xticks(sorted({k for points in lines.values() for k, _ in points}))
+            axis.set(xlabel=label, ylabel="recall  (%)", ylim=(0, 102))
+            axis.set_title(f"({chr(ord('a') + number % 26)}) {title}", fontsize=9.5)
+        for axis in axes.flat[len(drawn) :]:
+            axis.set_visible(False)
+        handles = {
+            label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=min(4, len(handles)))
     return True
+
+
+def _collapsed(panels: dict[str, dict[str, list[tuple[int, float]]]]) -> dict[str, dict[str, list[tuple[int, float]]]]:
+    """Panels of one set that show the same numbers, as protocols do to a model without cross-image encoder, as one."""
+    titles: dict[tuple[str, str], list[str]] = {}
+    for title in sorted(panels):
+        set_name, _, rest = title.partition(", ")
+        titles.setdefault((set_name, repr(sorted(panels[title].items()))), []).append(rest)
+    firsts = {(s, key): f"{s}, {rest[0]}" for (s, key), rest in titles.items()}
+    return {f"{s}, {' = '.join(rest)}": panels[firsts[s, key]] for (s, key), rest in titles.items()}

@@ -41,7 +41,7 @@ def error_plot(evaluated: EvaluationSet, result: Result, path: Path) -> None:
     width = 8.6 if columns == 1 else 11.0
     with canvas(width, lines * (width / columns - 0.6) * shape + 0.45 * lines + 1.5, path) as figure:
         axes = figure.subplots(lines, columns, squeeze=False)
-        for axis, area in zip(axes.flat, shown, strict=False):
+        for number, (axis, area) in enumerate(zip(axes.flat, shown, strict=False)):
             inside, here = of_database == area, of_queries == area
             origin = np.concatenate([database[inside], queries[here]]).min(axis=0)
             points, asking = database[inside] - origin, queries - origin
@@ -59,7 +59,7 @@ def error_plot(evaluated: EvaluationSet, result: Result, path: Path) -> None:
             axis.set_xlabel("metres east", fontsize=9)
             axis.set_ylabel("metres north", fontsize=9)
             if len(shown) > 1:
-                text = f"{(right & here).sum():,} of {here.sum():,} found"
+                text = f"({chr(ord('a') + number)}) area {number + 1}: {(right & here).sum():,} of {here.sum():,} found"
                 axis.set_title(text, fontsize=9, fontweight="normal", color=GREY)
         for axis in axes.flat[len(shown) :]:
             axis.set_visible(False)

@@ -18,8 +18,10 @@ from PIL import Image
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.evaluate import score
 from pipeline.evaluation.protocol import protocols
-from pipeline.evaluation.report import figures, html
+from pipeline.evaluation.report import figures
 from pipeline.evaluation.report.error_plots import areas
+from pipeline.evaluation.report.page import write_page
+from pipeline.evaluation.report.pictures import draw
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -84,9 +86,9 @@ def test_the_report_is_seen_whole_and_asks_nobody(tmp_path: Path) -> None:
     street = EvaluationSet("street", photos, photos[:4], positives, "pairs")
     rows, far = np.array([[0, 1], [1, 2], [3, 2], [4, 5]]), np.ones((4, 2), np.float32)
     result = score(street, protocols(config, 224, "pairs")[0], config, rows, far)
-    pictures = html.draw([result], [street], tmp_path / "figures")
+    pictures = draw([result], [street], tmp_path / "figures")
     page = tmp_path / "report.html"
-    html.write_report([result], pictures, page, "Street", {"checkpoint": "none"})
+    write_page([result], pictures, page, "Street", {"checkpoint": "none"})
     seen, heard = visit(page, tmp_path)
     assert heard == []
     assert share(seen, "#1428dc") > 0.02 and min(share(seen, c) for c in (figures.GREEN, figures.RED)) > 0.0005

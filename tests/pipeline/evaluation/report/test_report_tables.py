@@ -18,7 +18,9 @@ from pipeline.evaluation.evaluate import Result, score
 from pipeline.evaluation.predictions import load_predictions, save_predictions
 from pipeline.evaluation.protocol import protocols
 from pipeline.evaluation.recall import recall_at
-from pipeline.evaluation.report import figures, html, tables
+from pipeline.evaluation.report import figures, tables
+from pipeline.evaluation.report.page import write_page
+from pipeline.evaluation.report.pictures import draw
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 CONFIG = EvaluationConfig(recalls=(1, 5, 10), group_size=8)
@@ -161,14 +163,14 @@ def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
     sets = [street, sequence, unscored]
     results = [result for evaluated in sets for result in results_of(evaluated, config)]
     assert results[2].recalls == {}
-    pictures = html.draw(results, sets, tmp_path / "figures", Corner())
+    pictures = draw(results, sets, tmp_path / "figures", Corner())
     drawn = {p.path.name for p in pictures}
     assert drawn >= {"pitts30k.curves.png", "seq.single.errors.png", "seq.single.worst.jpg", "seq.attention.jpg"}
     assert {name for name in drawn if name.startswith("unknown")} == {
         "unknown.single.answers.jpg",
         "unknown.attention.jpg",
     }
-    html.write_report(results, pictures, tmp_path / "report.html", "A <test>", {"checkpoint": "a&b"})
+    write_page(results, pictures, tmp_path / "report.html", "A <test>", {"checkpoint": "a&b"})
     page = (tmp_path / "report.html").read_text()
     assert page.count("<img") == len(pictures) == page.count("base64,")
     assert not re.search(r'(?:src|href)="(?!data:|#)', page) and "<script" not in page and "url(" not in page
@@ -180,3 +182,76 @@ def test_attention_lies_where_the_tokens_are_large(street: EvaluationSet, tmp_pa
     assert maps.shape == (2, 4, 4) and np.argwhere(maps[0]).tolist() == [[1, 0]]
     figures.attention_overlay(Corner(), street.database[:2], tmp_path / "attention.png", "attention")
     assert Image.open(tmp_path / "attention.png").size[0] > 300
+
+
+def test_a_map_and_its_photo_have_one_extent(
+    street: EvaluationSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For a model of 32 px, whose photos are shown larger: the hot cell lies where its part of the photo is."""
+    from matplotlib.axes import Axes
+
+    from pipeline.paper.paper_figures import attention_comparison
+
+    drawn: dict[int, list[tuple[tuple[float, ...], tuple[int, ...]]]] = {}
+    plain = Axes.imshow
+
+    def watched(self: Axes, pixels: np.ndarray, **style: object) -> object:
+        image = plain(self, pixels, **style)  # type: ignore[arg-type]
+        drawn.setdefault(id(self), []).append((tuple(image.get_extent()), np.shape(pixels)[:2]))
+        return image
+
+    monkeypatch.setattr(Axes, "imshow", watched)
+    photos = street.database[:2]
+    figures.attention_overlay(Corner(), photos, tmp_path / "a.png", "attention")
+    attention_comparison(photos, [("one", figures.attention_maps(Corner(), photos))], 32, tmp_path / "b.png", "below")
+    pairs = [images for images in drawn.values() if len(images) == 2]
+    assert len(pairs) == 4
+    for (below, photo), (above, heat) in pairs:
+        assert below == above and photo == (224, 224) and heat == (4, 4)
+
+
+def test_figures_for_a_paper(street: EvaluationSet, tmp_path: Path) -> None:
+    curve = np.array([50.0, 60.0, 70.0])
+    draws = []
+    for name in ("first", "second"):
+        with figures.also_as(("pdf", "svg", "png")):
+            figures.recall_curves({"a": curve, "b": curve, "c": curve + 1}, tmp_path / name / "c.png", "t", "b", 100)
+        assert {p.name for p in (tmp_path / name).iterdir()} == {"c.png", "c.pdf", "c.svg", "c.300dpi.png"}
+        draws.append({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()})
+    assert draws[0] == draws[1], "the same results, the same files"
+    assert draws[0]["c.pdf"].startswith(b"%PDF") and b"a = b   R@1 50.0" in draws[0]["c.svg"]
+    with Image.open(tmp_path / "first/c.png") as small, Image.open(tmp_path / "first/c.300dpi.png") as large:
+        assert large.width / small.width == pytest.approx(300 / figures.DPI, rel=0.01)
+    assert not list((tmp_path / "second").glob("*.tmp"))
+
+
+def test_curves_that_coincide_share_a_line_and_intervals_hold_the_share() -> None:
+    curve = np.array([50.0, 100.0])
+    assert list(figures.collapse({"a": curve, "b": curve + 0.5, "c": curve.copy()})) == ["a = c", "b"]
+    low, high = figures.wilson(np.array([0.0, 50.0, 100.0]), 100)
+    # published values of the interval for 0, 50 and 100 successes in 100
+    assert low == pytest.approx([0.0, 40.383, 96.301], abs=0.01) and high == pytest.approx(
+        [3.699, 59.617, 100.0], abs=0.01
+    )
+
+
+HOSTILE = "<img src=x onerror=alert(1)> $\\frac{ [b] |*_\x1b[31m\n=1.jpg"
+
+
+def test_names_that_are_markup_stay_names(street: EvaluationSet, tmp_path: Path) -> None:
+    """A photo, a title and a remark with markup, mathematics and terminal escapes, through every picture and page."""
+    photo = tmp_path / HOSTILE
+    photo.write_bytes(street.queries[0].read_bytes())
+    hostile = dataclasses.replace(street, queries=[photo, *street.queries[1:]], remarks=(HOSTILE,))
+    config = dataclasses.replace(CONFIG, groups=("single",))
+    results = results_of(hostile, config)
+    pictures = draw(results, [hostile], tmp_path / "figures", Corner())
+    figures.answer_grid([(photo, [(photo, "0.1")])], tmp_path / "grid.jpg", HOSTILE, HOSTILE)
+    write_page(results, pictures, tmp_path / "report.html", HOSTILE, {HOSTILE: HOSTILE})
+    page = (tmp_path / "report.html").read_text()
+    assert "<img src=x" not in page and "&lt;img src=x" in page and "\x1b" not in page
+    assert page.count("<img") == len(pictures) and "{" not in page.split("</style>")[1].replace("frac{", "")
+    for text in (tables.table(results).text(), tables.markdown(results)):
+        assert "\x1b" not in text
+    tables.write_csv(results, tmp_path / "r.csv")
+    assert "\x1b" not in (tmp_path / "r.csv").read_text()
