@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.common.errors import DataError
+from pipeline.common.pictures import MAX_BYTES
 
 SCHEMA = pa.schema(
     [
@@ -96,10 +97,12 @@ def build(
     starts, counts = runs(unique)
     listed = unique.select(["city", "place_id"]).take(pa.array(starts)).append_column("images", pa.array(counts))
     out = list(left_out)
-    for row in unique.filter(pc.less_equal(unique["size"], 0)).to_pylist():
-        reason = {0: "empty file (0 bytes)", -1: "missing"}.get(row["size"], "cannot be read: no permission")
+    usable = pc.and_(pc.greater(unique["size"], 0), pc.less_equal(unique["size"], MAX_BYTES))
+    for row in unique.filter(pc.invert(usable)).to_pylist():
+        reason = {0: "empty file (0 bytes)", -1: "missing", -2: "cannot be read: no permission"}.get(row["size"])
+        reason = reason or f"too large: {row['size']:,} bytes, the limit is {MAX_BYTES:,}"
         out.append(LeftOut(row["path"], row["city"], row["place_id"], reason))
-    present = unique.filter(pc.greater(unique["size"], 0)).combine_chunks()
+    present = unique.filter(usable).combine_chunks()
     digest = _digest(kind, present, out)
     again = table.num_rows - unique.num_rows
     return Catalogue(kind, root, present, listed, tuple(sorted(out)), again, unlisted, digest, tuple(remarks))

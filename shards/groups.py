@@ -221,7 +221,7 @@ def _read(path: Path, rule: ImageRule, facts: dict[str, Any]) -> bytes | Refused
     except OSError as error:
         return Refused(f"cannot be read: {error.strerror}")
     except DataError as error:
-        return Refused(f"cannot be read: {error}")
+        return Refused(str(error))
     stored = admit(data, rule)
     facts["made_again"] += not isinstance(stored, Refused) and stored is not data
     return stored

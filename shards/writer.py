@@ -193,7 +193,8 @@ def _settings(path: Path) -> dict[str, Any]:
 def _compare(out: Path, before: dict[str, Any], now: dict[str, Any]) -> None:
     """Raises UsageError naming what differs between the settings in `out` and these."""
     old, new = _flat(before), _flat(now)
-    changes = [f"{k} {old.get(k)} -> {new.get(k)}" for k in sorted(old.keys() | new.keys()) if old.get(k) != new.get(k)]
+    keys = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key)]
+    changes = [f"{readable(key)} {readable(old.get(key))} -> {readable(new.get(key))}" for key in keys]
     if changes:
         raise UsageError(
             f"--out {out}: holds shards of another source or other settings: {', '.join(changes)}; "

@@ -5,11 +5,13 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import stat
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from pipeline.common.errors import UsageError
 from pipeline.common.text import shown
@@ -83,6 +85,23 @@ def reserve(path: Path, size: int) -> None:
                 raise OSError(error.errno, error.strerror, str(path)) from None
         else:
             file.truncate(size)
+
+
+def open_ordinary(path: Path) -> BinaryIO:
+    """Opens a file from outside for reading.
+
+    Raises:
+        OSError: it cannot be opened, or is a pipe, a device or a folder: reading a pipe never ends.
+    """
+
+    def opened(name: str, flags: int) -> int:
+        return os.open(name, flags | os.O_NONBLOCK)
+
+    stream = open(path, "rb", opener=opened)
+    if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+        stream.close()
+        raise OSError(errno.EINVAL, "not an ordinary file", str(path))
+    return stream
 
 
 def usual_permissions(path: Path) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import os
 import re
-import stat
 import warnings
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from pipeline.common.errors import DataError
+from pipeline.common.files import open_ordinary
 from pipeline.common.text import shown
 
 MAX_PIXELS = 1 << 27  # 134 million: more than phones and panoramas have; 400 MB as RGB
@@ -36,15 +36,13 @@ def read_file(path: Path) -> bytes:
     """The bytes of a photo's file.
 
     Raises:
-        OSError: it cannot be read.
-        DataError: it is no ordinary file (reading a pipe never ends), or larger than `MAX_BYTES`.
+        OSError: it cannot be read, or is no ordinary file.
+        DataError: it is larger than `MAX_BYTES`.
     """
-    with open(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as stream:  # noqa: PTH123
-        told = os.fstat(stream.fileno())
-        if not stat.S_ISREG(told.st_mode):
-            raise DataError("is not an ordinary file")
-        if told.st_size > MAX_BYTES:
-            raise DataError(f"has {told.st_size:,} bytes, more than {MAX_BYTES:,}")
+    with open_ordinary(path) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        if size > MAX_BYTES:
+            raise DataError(f"too large: {size:,} bytes, the limit is {MAX_BYTES:,}")
         return stream.read()
 
 

@@ -25,6 +25,8 @@ def gps_position(path: Path) -> tuple[tuple[float, float] | None, str]:
     """((latitude, longitude) in degrees, "") of a photo; (None, "") without GPS; (None, reason) where it is broken."""
     from PIL import Image
 
+    if not path.is_file():  # a pipe would be waited for; what is not there is named where its pixels are read
+        return None, ""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # other damaged EXIF
         try:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import os
-import stat
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from pyarrow import csv
 
 from pipeline.common.errors import DataError
+from pipeline.common.files import open_ordinary
 from pipeline.common.text import shown
 
 MAX_BYTES = 1 << 30  # of a table, unpacked; the largest of GSV-Cities has 5 MB
@@ -96,9 +95,7 @@ def _is_number(text: str) -> bool:
 def _content(path: Path) -> bytes:
     """The unpacked bytes of a table, bounded before it is read."""
     try:
-        with open(os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK), "rb") as stream:  # noqa: PTH123
-            if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
-                raise DataError(f"{shown(path)}: is not an ordinary file")
+        with open_ordinary(path) as stream:
             packed = path.name.lower().endswith(".gz")
             data = gzip.GzipFile(fileobj=stream).read(MAX_BYTES + 1) if packed else stream.read(MAX_BYTES + 1)
     except (OSError, EOFError, zlib.error) as error:

@@ -28,8 +28,8 @@ from pipeline.common.text import shown
 from shards.catalogue import SCHEMA, Catalogue, LeftOut, build
 from shards.sources.listing import files_below
 
-READ = (".jpg", ".jpeg", ".png")
-UNREAD = (".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif")
+READ = (".jpg", ".jpeg", ".jpe", ".jfif", ".png")
+UNREAD = (".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif", ".jxl", ".dng")
 _YAWS = 12  # directions of Pittsburgh's views around a spot
 
 

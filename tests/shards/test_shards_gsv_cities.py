@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -183,6 +185,23 @@ def test_parts_of_the_layout_are_refused_by_name(gsv: Callable[..., Path], tmp_p
     gsv({"PRS": [4]}, "third")
     with pytest.raises(UsageError, match=r"several data sets \(another, third\)"):
         detect(tmp_path)
+
+
+def test_a_citys_folder_that_may_not_be_read_is_named(
+    gsv: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tests may run as root, whom no permission stops: the system's answer is made."""
+    root, scan = gsv({"PRS": [4], "OSL": [4]}), os.scandir
+
+    def no_scan(path: object) -> object:
+        if str(path).endswith("OSL"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return scan(path)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(os, "scandir", no_scan)
+    found = gsv_cities.read(root)
+    assert found.table.num_rows == 4 and found.images == 8
+    assert {(x.city, x.reason) for x in found.left_out} == {("OSL", "cannot be read: no permission")}
 
 
 def test_half_a_layout_is_refused(tmp_path: Path) -> None:

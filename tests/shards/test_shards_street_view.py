@@ -50,14 +50,17 @@ def test_pictures_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     put(tmp_path, "cafe/1.jpg", "loose.jpg", "cafe/2.heic")
     put(tmp_path, "cafe/0.jpg", data=b"")
     (tmp_path / "cafe" / "gone.jpg").symlink_to("nowhere.jpg")
+    with (tmp_path / "cafe" / "sparse.jpg").open("wb") as stream:
+        stream.truncate(1 << 40)  # a hole: no room on the disk
     found = read_source(tmp_path)
     assert {(x.file, x.reason) for x in found.left_out} == {
         ("loose.jpg", "lies in no place's folder"),
         ("cafe/2.heic", "only JPEG and PNG are read"),
         ("cafe/0.jpg", "empty file (0 bytes)"),
         ("cafe/gone.jpg", "missing"),
+        ("cafe/sparse.jpg", "too large: 1,099,511,627,776 bytes, the limit is 1,073,741,824"),
     }
-    assert found.images == 5
+    assert found.images == 6
 
 
 def test_utm_names_are_grouped_by_cell_heading_and_zone(tmp_path: Path) -> None:
