@@ -13,7 +13,6 @@ import multiprocessing
 import os
 import re
 import shutil
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from pipeline.common import files
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import locked, write_atomically
 from pipeline.common.progress import Progress
@@ -114,11 +114,7 @@ def check_writable(out: Path) -> None:
     made = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     try:
         if not out.is_file():  # told later, with what else may be wrong with it
-            out.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=out).close()
-    except (OSError, ValueError) as error:  # ValueError: a name with a NUL
-        told = (isinstance(error, OSError) and error.strerror) or error
-        raise UsageError(f"--out {readable(out)}: cannot be written ({told}); give another folder") from None
+            files.check_writable(out, "--out")
     finally:
         for folder in made:
             with contextlib.suppress(OSError, ValueError):

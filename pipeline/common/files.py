@@ -97,7 +97,8 @@ def open_ordinary(path: Path) -> BinaryIO:
     def opened(name: str, flags: int) -> int:
         return os.open(name, flags | os.O_NONBLOCK)
 
-    stream = open(path, "rb", opener=opened)
+    # the caller closes it; Path.open has no opener
+    stream = open(path, "rb", opener=opened)  # noqa: SIM115
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
         stream.close()
         raise OSError(errno.EINVAL, "not an ordinary file", str(path))

@@ -137,7 +137,7 @@ def test_verify_ends_with_zero_on_a_whole_set(whole: dict[str, bytes], tmp_path:
         ((), 2, "--source DIR and --out DIR"),
         (("--source", "nowhere", "--out", "x"), 2, "no such folder"),
         (("--sorce", "x"), 2, "did you mean 'source'"),
-        (("--source", "/", "--out", "/proc/shards"), 2, "--out /proc/shards: cannot be written"),
+        (("--source", "/", "--out", "/proc/shards"), 2, "/proc/shards: cannot be written"),
     ],
 )
 def test_wrong_use_is_one_clear_line(words: tuple[str, ...], code: int, told: str, tmp_path: Path) -> None:
