@@ -54,7 +54,7 @@ def test_lists_and_switches_may_be_written_plainly() -> None:
         (["--data.places_per_bach", "8"], "did you mean 'data.places_per_batch'"),
         (["--lr", "1"], "did you mean 'train.lr'"),
         (["--train.lr", "fast"], "train.lr"),
-        (["--data.order", "random"], "data.order must be one of city, mixed, blocked; it is 'random'"),
+        (["--data.order", "random"], "data.order must be one of city, mixed, blocked, mined; it is 'random'"),
         (["--config", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )
