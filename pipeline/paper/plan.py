@@ -191,6 +191,10 @@ def _label(config: RunConfig, base: RunConfig) -> str:
         parts.append("other_data")
     if config.data.places_per_batch != base.data.places_per_batch:
         parts.append(f"places{config.data.places_per_batch}")
+    if config.data.order != base.data.order:
+        parts.append(config.data.order)
+    if config.train.passes != base.train.passes:
+        parts.append(config.train.passes)
     if config.train.steps != base.train.steps:
         parts.append(f"steps{config.train.steps}")
     elif config.train.epochs != base.train.epochs:

@@ -69,6 +69,23 @@ def _axis(values: tuple[float, ...], setting: str) -> dict[str, Row]:
     return rows
 
 
+def _mined() -> dict[str, Row]:
+    """Order of batches, and its control, each trained as published and jointly; near places count unless said."""
+    orders: dict[str, dict[str, Any]] = {
+        "city": {"data.order": "city"},
+        "mined": {"data.order": "mined", "data.mine_from": "single"},
+        "mined, permuted": {"data.order": "mined", "data.mine_from": "permuted"},
+        "mined, near ignored": {"data.order": "mined", "data.mine_from": "single", "loss.ignore_within": 25.0},
+    }
+    passes: dict[str, dict[str, Any]] = {"": {"train.passes": "group"}, "+joint": {"train.passes": "joint"}}
+    near = {"loss.ignore_within": 0.0}
+    return {
+        name + ending: Row(changes=near | order | way)
+        for ending, way in passes.items()
+        for name, order in orders.items()
+    }
+
+
 TABLES: dict[str, Table] = {
     "ablation_crica": Table(
         "Ablation on cross-image awareness",
@@ -156,6 +173,7 @@ TABLES: dict[str, Table] = {
             ),
         },
     ),
+    "mined": Table("Mined batches, and what they are compared with (a table of ours)", _mined()),
 }
 
 

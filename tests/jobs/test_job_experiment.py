@@ -163,6 +163,16 @@ def test_a_row_changes_only_what_it_says() -> None:
                 assert found.model == variant(row.variant, base.model)
 
 
+def test_the_table_of_mined_batches_has_its_controls() -> None:
+    """City, mined, permuted and near places ignored, each in both ways; rows differ in nothing else."""
+    found = {n: plan.training(RunConfig(), row, 0, lambda _: 10).config for n, row in TABLES["mined"].rows.items()}
+    told = [(c.data.order, c.data.mine_from, c.loss.ignore_within, c.train.passes) for c in found.values()]
+    assert len(set(told)) == 8 and {way for *_, way in told} == {"group", "joint"}
+    assert {(order, source, near) for order, source, near, _ in told} == {
+        ("city", "single", 0.0), ("mined", "single", 0.0), ("mined", "permuted", 0.0), ("mined", "single", 25.0)
+    }  # fmt: skip
+
+
 def test_same_settings_share_a_training_and_others_never_do() -> None:
     """Over all tables: equal names exactly where the configurations are equal."""
     named: dict[str, Any] = {}
@@ -236,11 +246,11 @@ def test_a_stopped_table_leaves_with_75_and_continues(root: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*ASKED, "parts"])
+@pytest.mark.parametrize("name", [*ASKED, "parts", "mined"])
 @pytest.mark.timeout(1800)
 def test_every_table_runs_to_its_end(root: Path, name: str) -> None:
     settings(root)
-    run(root, name)
+    run(root, name, *(["--data.clique", "2", "--train.epochs", "2"] if name == "mined" else []))
     rows = list(csv.DictReader((root / f"outputs/tables/{name}/table.csv").open()))
     left_out = {"dimensions": {"1024", "2048", "4096"}, "same_data": {"CricaVPR on Pitts30k"}}.get(name, set())
     assert {row["row"] for row in rows} == set(TABLES[name].rows) - left_out
