@@ -24,12 +24,14 @@ class Report:
     Attributes:
         loss: of the global batch.
         mined: percent of anchors with a mined pair, for each description of an image (joint training has two).
+        negatives: mined negative pairs an anchor.
         images_per_second: over all ranks.
         data_wait: percent of the time spent waiting for the loader.
     """
 
     loss: float
     mined: tuple[float, ...]
+    negatives: float
     images_per_second: float
     data_wait: float
 
@@ -50,6 +52,7 @@ class Meter:
         self._bar.resume_at(state.step)
         self._losses: list[float] = []
         self._mined: list[tuple[float, ...]] = []
+        self._negatives: list[float] = []
         self._waited = 0.0
         self._since = time.perf_counter()
         self._shown: Report | None = None
@@ -72,22 +75,24 @@ class Meter:
             self._waited += time.perf_counter() - start
             yield batch
 
-    def record(self, loss: float, mined: tuple[float, ...]) -> None:
-        """One step's loss and shares of anchors with a mined pair; moves the progress line."""
+    def record(self, loss: float, mined: tuple[float, ...], negatives: float) -> None:
+        """One step's loss, shares of anchors with a mined pair, mined negatives an anchor; moves the progress line."""
         self._losses.append(loss)
+        self._negatives.append(negatives)
         self._mined.append(tuple(100 * share for share in mined))
         now = self._current()
         mined_now = " and alone ".join(f"{percent:.0f}%" for percent in now.mined)
         self._bar.advance(
             1,
-            f"loss {now.loss:.4f}  mined {mined_now}  {now.images_per_second:.0f} images/s  "
-            f"data wait {now.data_wait:.0f}%",
+            f"loss {now.loss:.4f}  mined {mined_now}, {now.negatives:.1f} negatives each  "
+            f"{now.images_per_second:.0f} images/s  data wait {now.data_wait:.0f}%",
         )
 
     def report(self) -> Report:
         """Means since the last report, and a new start."""
         report = self._current()
-        self._losses, self._mined, self._waited, self._since = [], [], 0.0, time.perf_counter()
+        self._losses, self._mined, self._negatives = [], [], []
+        self._waited, self._since = 0.0, time.perf_counter()
         return report
 
     def _current(self) -> Report:
@@ -96,6 +101,7 @@ class Meter:
         return Report(
             sum(self._losses) / n,
             tuple(sum(kind) / n for kind in zip(*self._mined, strict=True)),
+            sum(self._negatives) / n,
             self.images * len(self._losses) / seconds,
             100 * self._waited / seconds,
         )

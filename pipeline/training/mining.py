@@ -14,13 +14,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from pipeline.common.errors import DataError, UsageError
 from pipeline.config import DataConfig, RunConfig
 from pipeline.data.cliques import CliqueRule, Mined, mine
 from pipeline.data.place_descriptors import read_descriptors
 from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import cities_of
-from pipeline.distributed import agreed, on_rank_0, rank
+from pipeline.distributed import broadcast_tensors, on_rank_0, rank
 from pipeline.model.vpr import PlaceModel
 from pipeline.training.checkpoint import RunState
 from shards.index import ShardIndex
@@ -86,7 +89,7 @@ class Mining:
         state.mined = on_rank_0(keep, what=f"writing descriptors under {self.folder}")
 
     def mined(self, state: RunState) -> Mined | None:
-        """What the epoch of `state` is planned from; None: nothing yet. Collective; the file is read once.
+        """What the epoch of `state` is planned from; None: nothing yet. Collective; rank 0 reads the file, once.
 
         Raises:
             DataError: the file is missing or not the one that the state names; the same on all ranks.
@@ -97,13 +100,17 @@ class Mining:
         path = Path(self.data.mine_from) if given else self._path(state.mined["file"])
         noted = str(state.mined.get("sha256", ""))
 
-        def load() -> tuple[str, Mined]:
-            if self._read is not None and self._read[0] == noted:
-                return self._read
-            found = read_descriptors(path, self.index.digest, self.index.places, noted)
-            return found.sha256, mine(found.values, cities_of(self.index), self.points, rule(self.data))
+        if self._read is None or self._read[0] != noted:
+            tensors: dict[str, Tensor] = {}
 
-        self._read = agreed(load, what=f"reading {path}")
+            def load() -> str:
+                found = read_descriptors(path, self.index.digest, self.index.places, noted)
+                tensors["descriptors"] = torch.from_numpy(found.values)
+                return found.sha256
+
+            sha256 = on_rank_0(load, what=f"reading {path}")  # the others need not see the file
+            values = broadcast_tensors(tensors)["descriptors"].numpy()
+            self._read = sha256, mine(values, cities_of(self.index), self.points, rule(self.data))
         if given:
             state.mined = {"file": str(path), "sha256": self._read[0], "epoch": 0}
         return self._read[1]
@@ -160,7 +167,7 @@ def check_rule(data: DataConfig) -> None:
         )
     if data.mine_neighbours < data.clique - 1:
         raise UsageError(f"data.mine_neighbours ({data.mine_neighbours}) is fewer than a group needs (data.clique - 1)")
-    if data.mine_from not in MODEL and not Path(data.mine_from).is_file():
+    if data.mine_from not in MODEL and rank() == 0 and not Path(data.mine_from).is_file():
         raise DataError(f"data.mine_from: {data.mine_from} is neither {' nor '.join(MODEL)} nor a file of jobs.mine")
 
 

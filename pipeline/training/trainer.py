@@ -144,7 +144,9 @@ class Trainer:
         self.engine.load(optimizer, self.state.scaler)
 
         self.loss = build_loss(config, self.index).to(accelerator.device)
-        self.mining = Mining(config, self.index, self.run, origin) if config.data.order == "mined" else None
+        self.mining: Mining | None = None
+        if config.data.order == "mined":
+            self.mining = agreed(lambda: Mining(config, self.index, self.run, origin))
         self.validation: Validation | None = None
         if config.validate.sets:
             self.validation = agreed(lambda: Validation(config, accelerator.device), what="reading validate.sets")
@@ -210,9 +212,8 @@ class Trainer:
         )  # fmt: skip
         if loader.plan.in_cliques and self.main:
             share = 100 * loader.plan.in_cliques / loader.plan.batches.size
-            print(
-                f"epoch {state.epoch + 1}: {share:.0f} % of the places are in mined groups", file=sys.stderr, flush=True
-            )
+            told = f"epoch {state.epoch + 1}: {share:.0f} % of the places are in mined groups"
+            print(told, file=sys.stderr, flush=True)
         self.engine.model.train()
         meter = Meter(config.data.places_per_batch * 4, self.total_steps, state, enabled=self.main)
         with meter:
@@ -278,7 +279,7 @@ class Trainer:
         state.cursor += 1
         self._log_samples(batch.keys)
         mined = self.loss.statistics()
-        meter.record(value, mined.by_pass)
+        meter.record(value, mined.by_pass, mined.negatives)
         if state.step % config.train.log_every == 0 or state.step == self.total_steps:
             report = meter.report()
             self.tracker.metrics(
@@ -286,7 +287,7 @@ class Trainer:
                     "train/loss": report.loss,
                     **mined_metrics(report.mined),
                     "train/mined_positives": mined.positives,
-                    "train/mined_negatives": mined.negatives,
+                    "train/mined_negatives": report.negatives,
                     "train/images_per_second": report.images_per_second,
                     "train/data_wait": report.data_wait,
                     "train/lr": rate,

@@ -72,23 +72,21 @@ def describe_places(
     unaltered = dataclasses.replace(data, augment="off", order="city")
     loader = iter(PlaceLoader(index, unaltered, planned, 0, 0, distributed.rank(), w))
     first = distributed.rank() == 0
-    with (
-        evaluating(model),
-        tempfile.TemporaryFile(dir=temporary) as file,
-        Progress("mining: describing places", total, "places", enabled=first) as bar,
-    ):
 
-        def room() -> np.ndarray | None:
-            if not first:
-                return None
-            size = total * model.descriptor_dim * 2
+    def room() -> np.ndarray | None:
+        """A file without a name for the descriptors [P, D] before PCA, on rank 0."""
+        if not first:
+            return None
+        size = total * model.descriptor_dim * 2
+        with tempfile.TemporaryFile(dir=temporary) as file:
             if hasattr(os, "posix_fallocate"):  # writing into a mapped hole of a full disk kills
                 os.posix_fallocate(file.fileno(), 0, size)
             else:
                 file.truncate(size)
             return np.memmap(file, np.float16, "r+", shape=(total, model.descriptor_dim))
 
-        every = distributed.agreed(room, what="making room for descriptors")
+    every = distributed.agreed(room, what="making room for descriptors")
+    with evaluating(model), Progress("mining: describing places", total, "places", enabled=first) as bar:
         for step in range(steps):
             stopped()
             batch = distributed.agreed(lambda: next(loader), what="reading places to mine from")
