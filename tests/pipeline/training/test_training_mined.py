@@ -1,4 +1,4 @@
-"""Real runs in mined order: killed while mining on 2 ranks, resumed on 2 and on 1, and a changed file."""
+"""Real runs in mined order: killed while mining on 2 ranks, resumed on 2 and 1, a changed file."""
 
 from __future__ import annotations
 
@@ -82,7 +82,9 @@ def test_mined_runs_are_exact_given_their_files(root: Path) -> None:
     mined = mine(descriptors.values, cities_of(index), points(index.positions()), CliqueRule(2, 8, 150.0, 0.01))
     batches = plan(index, 0, 2, 4, "mined", mined=mined).batches
     whole = samples(root, "whole")
-    assert [whole[step] for step in range(2 * STEPS + 1, 3 * STEPS + 1)] == [index.table.take(rows)["sample"].to_pylist() for rows in batches]
+    assert [whole[step] for step in range(2 * STEPS + 1, 3 * STEPS + 1)] == [
+        index.table.take(rows)["sample"].to_pylist() for rows in batches
+    ]
     assert [whole[step] for step in range(1, STEPS + 1)] == [
         index.table.take(rows)["sample"].to_pylist() for rows in plan(index, 0, 0, 4, "city").batches
     ]
@@ -131,7 +133,9 @@ def test_a_file_of_jobs_mine_plans_every_epoch(root: Path) -> None:
         digests[name] = printed.split("sha256 ")[1].split()[0]
     assert (root / "one.safetensors").read_bytes() == (root / "two.safetensors").read_bytes()
     index = read_index(shards)
-    one, mixed = (read_descriptors(root / f"{n}.safetensors", index.digest, PLACES, digests[n]) for n in ("one", "mixed"))
+    one, mixed = (
+        read_descriptors(root / f"{n}.safetensors", index.digest, PLACES, digests[n]) for n in ("one", "mixed")
+    )
     cities = cities_of(index)
     for city in (0, 1):  # the same descriptors, of other places of the city
         rows = [sorted(map(bytes, found.values[cities == city])) for found in (one, mixed)]
@@ -144,7 +148,9 @@ def test_a_file_of_jobs_mine_plans_every_epoch(root: Path) -> None:
     mined = mine(one.values, cities, points(index.positions()), CliqueRule(2, 8, 150.0, 0.01))
     batches = plan(index, 0, 0, 4, "mined", mined=mined).batches
     found = samples(root, "given")
-    assert [found[step] for step in range(1, STEPS + 1)] == [index.table.take(rows)["sample"].to_pylist() for rows in batches]
+    assert [found[step] for step in range(1, STEPS + 1)] == [
+        index.table.take(rows)["sample"].to_pylist() for rows in batches
+    ]
     assert all(state["mined"]["sha256"] == digests["one"] for state in states(root, "given"))
 
 
