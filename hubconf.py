@@ -18,28 +18,38 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from pipeline.model.beside import BesideBank
     from pipeline.model.vpr import PlaceModel
 
 dependencies = ["torch", "transformers", "safetensors", "numpy", "PIL"]
 
 
-def place_model(path: str, device: str = "cpu", image_size: int | None = None) -> PlaceModel:
+def place_model(
+    path: str, device: str = "cpu", image_size: int | None = None, bank: bool = True
+) -> PlaceModel | BesideBank:
     """The model of a run folder, a checkpoint folder, a file of ours, or a release of a whole model, in eval mode.
 
-    `model(images [b, 3, S, S])` gives unit descriptors [b, R*D]; the b images are one group of the cross-image
-    encoder, so pass them one at a time (or see `groups` in the documentation of the evaluation).
+    `model(images [b, 3, S, S])` gives unit descriptors [b, R*D]. Where training saved a bank beside the weights, each
+    image is described beside it and no image changes another's descriptor (`pipeline.model.beside`). Without a bank the
+    b images are one group of the cross-image encoder, so pass them one at a time.
 
     Args:
         path: where the weights are.
         device: where the model goes.
         image_size: side S of the input in pixels; none: what the file says, the method's own for a release.
+        bank: False leaves a bank out.
 
     Raises:
         UsageError: nothing there, or weights that do not fit; DataError: a broken file.
     """
     import pipeline
 
-    return pipeline.load_model(path, device, image_size).module
+    model = pipeline.load_model(path, device, image_size).module
+    if not bank or model.bank is None:
+        return model
+    from pipeline.model.beside import BesideBank
+
+    return BesideBank(model, model.bank)
 
 
 def place_input(photo: str | Path | bytes, image_size: int = 224) -> Tensor:
@@ -53,10 +63,10 @@ def place_input(photo: str | Path | bytes, image_size: int = 224) -> Tensor:
     return normalise(to_input(load_image(photo), image_size))[None]
 
 
-def _entry(name: str) -> Callable[..., PlaceModel]:
+def _entry(name: str) -> Callable[..., PlaceModel | BesideBank]:
     def build(
         path: str | None = None, backbone: str | None = None, image_size: int | None = None, device: str = "cpu"
-    ) -> PlaceModel:
+    ) -> PlaceModel | BesideBank:
         from pipeline.common.errors import UsageError
         from pipeline.model.variants import variant
         from pipeline.model.vpr import build_model

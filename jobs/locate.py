@@ -49,6 +49,9 @@ class LocateJob:
     """Building: antialias as in training; published: normalise, then resize without."""
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
     """Building: autocast of the per-image part."""
+    groups: Literal["auto", "bank", "single"] = "auto"
+    """Building: each photo beside the bank of training images that lies beside the weights (docs/one_photo.md), or
+    alone; auto: beside the bank where there is one."""
     batch: int | None = None
     """Building: images a forward pass; none: 1 on a CPU, which loses little there and makes an index the same to the
     last bit however it has grown, and 32 on a GPU."""
@@ -115,8 +118,9 @@ def run(job: LocateJob) -> None:
     fingerprint = model_fingerprint(model)
     if job.build:
         batch = job.batch or (1 if torch.device(device).type == "cpu" else 32)
-        config = EvaluationConfig(resize=job.resize, precision=job.precision, search=job.search, pca=job.pca,
-                                  batch=batch, workers=job.workers)  # fmt: skip
+        groups = job.groups if job.groups != "auto" else "single" if model.bank is None else "bank"
+        config = EvaluationConfig(groups=(groups,), resize=job.resize, precision=job.precision, search=job.search,
+                                  pca=job.pca, batch=batch, workers=job.workers)  # fmt: skip
         sources, about = [Path(source) for source in job.build], {"checkpoint": str(file)}
         index = make_index(model, sources, folder, config, device, fingerprint, about)
         where = {"none": "without positions", "utm": "with UTM positions", "degrees": "with latitude and longitude"}
@@ -175,9 +179,9 @@ def tell(job: LocateJob, index: object, answers: Sequence[object]) -> None:
     (output / "answers.json").write_text(json.dumps({**about, "photos": rows}, indent=2) + "\n")
     written = [output / "answers.json"]
     if job.figures:
-        below = (
-            f"{len(index.photos):,} photos in {index.folder.name} · {index.protocol.search} search · each photo alone"
-        )
+        protocol = index.protocol
+        how = f"each photo beside {protocol.group_size} others" if protocol.groups == "bank" else "each photo alone"
+        below = f"{len(index.photos):,} photos in {index.folder.name} · {protocol.search} search · {how}"
         left = f", the first {SHOWN} of {len(pictured)}" if len(pictured) > SHOWN else ""
         figures.answer_grid(pictured[:SHOWN], output / "answers.jpg", f"The most similar places{left}", below)
         written.append(output / "answers.jpg")

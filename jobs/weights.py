@@ -47,8 +47,9 @@ class WeightsJob:
     """Side of the input in pixels; none: what the file says, for released weights the method's own (CricaVPR: 224)."""
     variant: str = ""
     """For a backbone: write the whole model of the paper's variant around it, untrained."""
-    onnx: Literal["descriptors", "regions"] = "descriptors"
-    """.onnx: descriptors with each image as its own group, or the regional features before the cross-image encoder."""
+    onnx: Literal["descriptors", "single", "regions"] = "descriptors"
+    """.onnx: descriptors, each image beside the bank where the source has one, else as its own group; single: as its
+    own group in any case; or the regional features before the cross-image encoder."""
     model: ModelConfig = field(default_factory=ModelConfig)
     """Sizes where a released CricaVPR or backbone is not the paper's; other methods' releases tell their own."""
 
@@ -119,7 +120,7 @@ def _write(model: PlaceModel, target: Path, job: WeightsJob) -> None:
 
         difference = export_onnx(model, target, job.onnx)
         print(f"  onnxruntime against torch, 1 and 3 images: largest difference {difference:.1e}")
-        _wrote(target, f"input 'images' [batch, 3, {model.image_size}, {model.image_size}], output '{job.onnx}'")
+        _wrote(target, f"input 'images' [batch, 3, {model.image_size}, {model.image_size}], one output")
     elif target.suffix == ".pth":
         convert.write_published(model, target)
         _wrote(target, "published names, tensors alone")

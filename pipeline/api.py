@@ -24,6 +24,7 @@ import torch
 from pipeline.common.errors import UsageError
 from pipeline.config import EvaluationConfig, ModelConfig, RunConfig
 from pipeline.evaluation import evaluate as evaluation
+from pipeline.evaluation.describe.bank import chosen_bank
 from pipeline.evaluation.describe.encode import evaluating
 from pipeline.evaluation.describe.sides import Engine
 from pipeline.evaluation.evaluate import Result
@@ -36,7 +37,7 @@ from pipeline.model.weights.convert import kind_of, read_model
 if TYPE_CHECKING:
     from pipeline.training.trainer import Outcome
 
-Groups = Literal["single", "shuffled", "ordered"]
+Groups = Literal["single", "shuffled", "ordered", "bank"]
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Model:
     def describe(
         self,
         photos: str | Path | Sequence[str | Path],
-        groups: Groups = "single",
+        groups: Groups | None = None,
         config: EvaluationConfig | None = None,
         side: Side = "database",
     ) -> np.ndarray:
@@ -67,8 +68,10 @@ class Model:
 
         Args:
             photos: paths; or a folder, whose photos are taken in the order of their names.
-            groups: which photos share the cross-image encoder: each alone, seeded random groups, or neighbours.
-            config: gives group_size, group_seed, resize, precision, batch and workers; none: the defaults.
+            groups: which photos share the cross-image encoder: each alone, seeded random groups, neighbours, or each
+                beside a bank; none: beside the bank that training saved with the model, alone where there is none.
+            config: gives bank, bank_from, group_size, group_seed, resize, precision, batch and workers; none: the
+                defaults.
             side: of an evaluation set; it changes only the draw of `shuffled` groups.
 
         Returns:
@@ -80,14 +83,16 @@ class Model:
         paths = list_images(Path(photos)) if isinstance(photos, (str, Path)) else [Path(path) for path in photos]
         if not paths:
             raise UsageError("describe: no photos were given")
+        groups = groups or ("single" if self.module.bank is None else "bank")
         wanted = dataclasses.replace(config or EvaluationConfig(), groups=(groups,), store="none", pca=None)
         nothing: list[np.ndarray] = [np.zeros(0, np.int64)] * len(paths)
         described = EvaluationSet("photos", paths, paths, nothing, "")
         found = np.empty((len(paths), self.descriptor_dim), np.float32)
         with evaluating(self.module), tempfile.TemporaryDirectory() as folder:
             engine = Engine(self.module, wanted, self.device, None, Path(folder), False, "")
-            (protocol,) = protocols(wanted, self.module.image_size, "")
-            encoded = engine.side(described, side, [protocol])
+            bank = chosen_bank(self.module, wanted, paths, self.device)
+            (protocol,) = protocols(wanted, self.module.image_size, "", bank)
+            encoded = engine.side(described, side, [protocol], bank)
             blocks = encoded.describe(protocol)
             if blocks is not None:  # None on ranks other than 0
                 for rows, values in blocks():

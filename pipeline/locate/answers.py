@@ -1,7 +1,8 @@
 """Where was this photo taken: the places of an index of a user's own photos that look most like a new one.
 
-Invariant: every descriptor is of one image alone (`single`), and photos that ask are described and searched one by one,
-so that an answer never depends on which other photos were asked about, to the last bit.
+Invariant: every descriptor is of one image alone (`single`), or beside the model's own bank (`bank`). Photos that ask
+are described and searched one by one, so that an answer never depends on which other photos were asked about, to the
+last bit.
 """
 
 from __future__ import annotations
@@ -15,14 +16,16 @@ import numpy as np
 import torch
 from torch import nn
 
-from pipeline.common.errors import DataError
+from pipeline.common.errors import DataError, UsageError
 from pipeline.common.progress import track
 from pipeline.evaluation.describe.broken import broken_photos, problem_of
 from pipeline.evaluation.describe.encode import describe_alone, evaluating
+from pipeline.evaluation.protocol import Protocol
 from pipeline.evaluation.search.approximate import search_index
 from pipeline.evaluation.sets.utm import WIDEST, meridian_offset, metres_between, to_utm
 from pipeline.locate.gps import gps_position
 from pipeline.locate.photo_index import PhotoIndex
+from pipeline.model.cross_image import Memory
 
 NAMES = {"utm": ("utm_east", "utm_north"), "degrees": ("lat", "lon")}
 
@@ -74,13 +77,15 @@ def locate(
 
     Raises:
         DataError: photos that do not decode (all named, `broken_photos`), or whose descriptor is not finite.
+        UsageError: the index was made beside another bank than the model has.
     """
     device, protocol = torch.device(device), index.protocol
     answers = []
     with evaluating(model):
+        memory = memory_of(model, protocol)
         for photo in track(photos, "locating", unit="photos") if progress else photos:
             try:
-                described = describe_alone(model, photo, protocol.resize, protocol.precision, device)
+                described = describe_alone(model, photo, protocol.resize, protocol.precision, device, memory)
             except DataError as error:
                 broken = [at for at, other in enumerate(photos) if problem_of(other)]
                 raise broken_photos(photos, broken, "photos to locate") from error
@@ -107,6 +112,25 @@ def locate(
                 )
             )
     return answers
+
+
+def memory_of(model: Any, protocol: Protocol) -> Memory | None:
+    """What an index's photos are described beside; None for `single`. For a model in `evaluating`.
+
+    Raises:
+        UsageError: the model has another bank, or none.
+    """
+    if protocol.groups != "bank":
+        return None
+    bank = None if model.bank is None else model.bank.first(protocol.group_size)
+    if bank is None or bank.digest != protocol.bank_digest:
+        has = "none" if bank is None else bank.digest
+        raise UsageError(
+            f"the index was made beside the bank {protocol.bank_digest}, and this checkpoint's is {has}: put the bank "
+            "back beside the weights, or build the index again"
+        )
+    memory: Memory = model.remember(bank)
+    return memory
 
 
 def place_text(position: tuple[float, float] | None, coordinates: str) -> str:

@@ -31,6 +31,7 @@ from torch import nn
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import locked, sync_path, write_atomically
 from pipeline.config import EvaluationConfig
+from pipeline.evaluation.describe.bank import chosen_bank
 from pipeline.evaluation.describe.encode import describe_each, evaluating
 from pipeline.evaluation.protocol import Protocol, protocols
 from pipeline.evaluation.search.approximate import build_index, load_index, save_index
@@ -41,6 +42,7 @@ from pipeline.locate.photos import Photos, find_photos
 FORMAT = "place-index 2"
 ABOUT, INDEX, PHOTOS, PCA = "about.json", "index.faiss", "photos.parquet", "pca.safetensors"
 DESCRIBED, LOCK = "described", ".lock"
+LARGEST = 65_536  # images of a bank: all that it has
 
 
 @dataclass(frozen=True)
@@ -103,8 +105,9 @@ def make_index(
 
     Args:
         sources: folders of photos, or manifests (`photos.find_photos`).
-        config: its `resize`, `precision`, `search`, `pca` and `pca_whiten` make the index; `batch` and `workers` its
-            speed. A `batch` above 1 may change the rounding of descriptors.
+        config: its `resize`, `precision`, `search`, `pca` and `pca_whiten` make the index, and the first of its
+            `groups`: `bank` (the model's own) or `single`; `batch` and `workers` its speed. A `batch` above 1 may
+            change the rounding of descriptors.
         fingerprint: identifies the weights (`evaluate.model_fingerprint`).
         about: more to be kept in `about.json`, such as the checkpoint's path.
 
@@ -113,20 +116,26 @@ def make_index(
         UsageError: more PCA dimensions than photos; a folder that holds other things, or that another build works in.
     """
     sources = [sources] if isinstance(sources, Path) else list(sources)
-    config = dataclasses.replace(config, groups=("single",), store="none", pca_from=None, rerank=0)
-    protocol = protocols(config, int(model.image_size), "none")[0]  # type: ignore[arg-type]
+    groups: Any = ("bank",) if config.groups[0] == "bank" else ("single",)
+    config = dataclasses.replace(
+        config, groups=groups, bank_from="train", bank=LARGEST, store="none", pca_from=None, rerank=0
+    )
+    bank = chosen_bank(model, config, (), device)
+    protocol = protocols(config, int(model.image_size), "none", bank)[0]  # type: ignore[arg-type]
     photos = find_photos(sources, progress)
     with _building(folder):
         former = _former(folder)
         settings = {"fingerprint": fingerprint, "image_size": protocol.image_size, "resize": protocol.resize}
-        kept = KeptDescriptors(folder / DESCRIBED, {**settings, "precision": protocol.precision})
+        beside = {"bank": protocol.bank_digest} if bank is not None else {}
+        kept = KeptDescriptors(folder / DESCRIBED, {**settings, "precision": protocol.precision, **beside})
         found = kept.find(photos.files, photos.states)
         missing = [at for at in range(len(photos.files)) if at not in found]
         growth = _growth(former, photos, len(missing))
         if missing:
             paths, rows = [photos.files[at] for at in missing], np.array(missing, np.int64)
             with evaluating(model):
-                each = describe_each(model, paths, config, torch.device(device), "describing", progress)
+                memory = None if bank is None else model.remember(bank)  # type: ignore[operator]
+                each = describe_each(model, paths, config, torch.device(device), "describing", progress, memory)
                 kept.keep(photos.files, photos.states, ((rows[positions], values) for positions, values in each))
             found = kept.find(photos.files, photos.states)
         contents = _contents(photos, protocol, fingerprint)

@@ -223,16 +223,21 @@ def _next(loader: Iterator[tuple[Tensor, list[int]]]) -> tuple[Tensor, list[int]
         return torch.empty(0), [], error
 
 
-def describe_alone(model: nn.Module, photo: Path, resize: Any, precision: Any, device: torch.device) -> np.ndarray:
+def describe_alone(
+    model: nn.Module, photo: Path, resize: Any, precision: Any, device: torch.device, memory: Memory | None = None
+) -> np.ndarray:
     """The descriptor [1, dim] of one photo, in a forward pass of its own: other photos cannot even change its rounding.
 
-    For a model in `evaluating`. Raises `DataError` naming a broken photo.
+    `memory`: of a bank (`PlaceModel.remember`), beside which it is described; None: in a group of its own. For a model
+    in `evaluating`. Raises `DataError` naming a broken photo.
     """
     images = to_input(load_image(photo), int(model.image_size), resize)[None]  # type: ignore[arg-type]
     config = EvaluationConfig(precision=precision)
     regions = encode_batch(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
-    described: np.ndarray = model.correlate(regions).float().cpu().numpy()  # type: ignore[operator]
-    return described
+    whole: Any = model
+    described: Tensor = whole.correlate(regions) if memory is None else whole.correlate_beside(regions, memory)
+    numbers: np.ndarray = described.float().cpu().numpy()
+    return numbers
 
 
 def describe_each(
@@ -242,8 +247,10 @@ def describe_each(
     device: torch.device,
     label: str = "describing",
     progress: bool = True,
+    memory: Memory | None = None,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(positions [n], descriptors [n, dim]) of images, each a group of its own, a forward batch at a time.
+    """(positions [n], descriptors [n, dim]) of images, a forward batch at a time; each is a group of its own, or beside
+    the bank of `memory`.
 
     For a model in `evaluating`, on one process; nothing is kept. With `config.batch` 1 each is what `describe_alone`
     gives, to the last bit. Raises `DataError` naming the broken images, after what came before the first was given.
@@ -259,7 +266,9 @@ def describe_each(
                 found = _broken(label, broken, left, iter(()), len(paths), progress)
                 raise broken_photos(paths, found, label)
             regions = encode_batch(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
-            if together and len(batch) > 1:
+            if memory is not None:
+                described = model.correlate_beside(regions, memory)  # type: ignore[operator]
+            elif together and len(batch) > 1:
                 described = model.correlate(regions, alone=True)  # type: ignore[operator]
             else:
                 described = torch.cat([model.correlate(one[None]) for one in regions])  # type: ignore[operator]

@@ -1,8 +1,9 @@
 """The per-image path as an ONNX file, checked by onnxruntime against torch before it is put in its place.
 
 Invariant: what is exported does not look across images. `regions` is `encode`, which never does. `descriptors` is the
-whole model with every image as a group of its own (`groups: single`), at any batch: the cross-image encoder's layers
-are shared by the regions and know no positions, so b images alone are one image with b*R regions, and that is exact.
+whole model, at any batch: beside its bank where it has one, whose keys and values are constants of the graph; else, or
+with `single`, with every image as a group of its own. The cross-image encoder's layers are shared by the regions and
+know no positions, so b images alone are one image with b*R regions, and that is exact.
 """
 
 from __future__ import annotations
@@ -24,25 +25,30 @@ from torch import Tensor, nn
 from pipeline.common.errors import DataError, UsageError
 from pipeline.config import to_dict
 from pipeline.data.images import MEAN, STD
+from pipeline.model.beside import BesideBank
 from pipeline.model.vpr import PlaceModel
 
-Output = Literal["descriptors", "regions"]
+Output = Literal["descriptors", "single", "regions"]
 PACKAGES = ("onnx", "onnxruntime", "onnxscript")
 TOLERANCE = 1e-4  # of the largest value; float32 with another order of sums stays a hundred times below
 
 
 class PerImage(nn.Module):
-    """images [b, 3, S, S], normalised -> regions [b, R, D], or descriptors [b, R*D] with each image alone."""
+    """images [b, 3, S, S], normalised -> regions [b, R, D], or descriptors [b, R*D]."""
 
     def __init__(self, model: PlaceModel, output: Output) -> None:
         super().__init__()
         self.model, self.output = model, output
+        self.beside = BesideBank(model, model.bank) if output == "descriptors" and model.bank is not None else None
 
     def forward(self, images: Tensor) -> Tensor:
         """[b, 3, S, S] -> [b, R, D] or [b, R*D]."""
         regions = self.model.encode(images)
         if self.output == "regions":
             return regions
+        if self.beside is not None:
+            related = self.model.cross_image.beside(regions, self.beside.memory())
+            return F.normalize(related.flatten(1), dim=-1)
         alone = self.model.cross_image(regions.flatten(0, 1)[None])
         return F.normalize(alone.view_as(regions).flatten(1), dim=-1)
 
@@ -73,19 +79,24 @@ def export_onnx(model: PlaceModel, path: Path, output: Output = "descriptors") -
 
 def _write(model: PlaceModel, file: Path, output: Output) -> None:
     per_image = PerImage(model, output).eval()
+    named = "regions" if output == "regions" else "descriptors"
+    groups = "none: encode alone" if output == "regions" else "single"
+    if per_image.beside is not None:
+        bank = per_image.beside.bank
+        groups = f"bank of {len(bank.regions)} images from {bank.source}, {bank.digest}"
     batch = torch.export.Dim("batch", min=1)
     example = torch.zeros(2, 3, model.image_size, model.image_size)
     with _quiet(), torch.no_grad():
         graph = torch.export.export(per_image, (example,), dynamic_shapes={"images": {0: batch}})
         program: Any = torch.onnx.export(
-            graph, (), None, input_names=["images"], output_names=[output], dynamo=True, verbose=False
+            graph, (), None, input_names=["images"], output_names=[named], dynamo=True, verbose=False
         )
     program.model.metadata_props.update(
         {
             "config": json.dumps(to_dict(model.config)),
             "image_size": str(model.image_size),
             "normalisation": json.dumps({"scale": 255, "mean": MEAN, "std": STD}),
-            "groups": "single" if output == "descriptors" else "none: encode alone",
+            "groups": groups,
         }
     )
     program.save(file)
@@ -104,10 +115,12 @@ def check(model: PlaceModel, file: Path, output: Output) -> float:
     worst = 0.0
     for count in (1, 3):
         images = torch.randn(count, 3, model.image_size, model.image_size, generator=generator)
-        one = model.encode if output == "regions" else model
+        one: Any = model.encode if output == "regions" else model
+        if output == "descriptors" and model.bank is not None:
+            one = BesideBank(model, model.bank)
         with torch.no_grad():
             wanted = torch.cat([one(image[None]) for image in images])
-        found = torch.from_numpy(session.run([output], {"images": images.numpy()})[0])
+        found = torch.from_numpy(session.run(None, {"images": images.numpy()})[0])
         difference = float((found - wanted).abs().max()) if found.shape == wanted.shape else float("inf")
         if not difference <= TOLERANCE * float(wanted.abs().max()):
             raise DataError(f"{file.name}: onnxruntime differs from torch by {difference:.1e}; the file was not kept")

@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 from tiny import photo, prepare, run_settings
 from torch import Tensor, nn
 
+from pipeline.api import Model
 from pipeline.common.errors import DataError, UsageError
 from pipeline.config import (
     AdapterConfig,
@@ -26,6 +27,7 @@ from pipeline.config import (
     ModelConfig,
     PoolingConfig,
 )
+from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.describe.bank import chosen_bank, drawn
 from pipeline.evaluation.describe.encode import evaluating
 from pipeline.evaluation.describe.sides import Engine
@@ -33,7 +35,10 @@ from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.protocol import protocols
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.evaluation.sets.load import load_set
+from pipeline.locate.answers import locate
+from pipeline.locate.photo_index import make_index
 from pipeline.model.bank import bank_beside, make_bank, read_bank, save_bank
+from pipeline.model.beside import BesideBank
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.convert import write_model
 from pipeline.model.weights.files import load_model
@@ -163,6 +168,32 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path: Path) -> None:
         chosen_bank(built, dataclasses.replace(config, bank_from=str(tmp_path / "nowhere")), [], "cpu")
     with pytest.raises(UsageError, match="model's are"):
         built.remember(make_bank(torch.zeros(3, 2, 16), "train"))
+
+
+def test_every_way_to_a_descriptor_takes_the_bank_of_the_model(tmp_path: Path, photos: EvaluationSet) -> None:
+    """From Python, as a module (torch.hub), and in an index of photos that is asked; equal to the last bit."""
+    built = model().eval()
+    built.bank = make_bank(torch.randn(6, built.regions, 16), "train")
+    paths, device = photos.database[:9], torch.device("cpu")
+    images = [normalise(to_input(load_image(path), 28))[None] for path in paths]
+    with evaluating(built):
+        memory = built.remember(built.bank)
+        truth = torch.cat([built.correlate_beside(built.encode(image), memory) for image in images])
+        assert torch.equal(torch.cat([BesideBank(built, built.bank)(image) for image in images]), truth)
+    assert Model(built, device).describe(paths, config=EvaluationConfig(workers=0, batch=1)).tobytes() == (
+        truth.numpy().tobytes()
+    )
+    config = EvaluationConfig(groups=("bank",), workers=0, batch=1)
+    index = make_index(
+        built, photos.database[0].parent, tmp_path / "index", config, device, "of a test", progress=False
+    )
+    assert index.protocol.name == "bank6" and index.protocol.bank_digest == built.bank.digest
+    answers = locate(built, index, paths, 2, device, progress=False)
+    rows = [photos.database.index(path) for path in paths]
+    assert [answer.rows[0] for answer in answers] == rows and max(answer.distances[0] for answer in answers) == 0
+    built.bank = make_bank(torch.randn(6, built.regions, 16), "train")
+    with pytest.raises(UsageError, match=r"made beside the bank .* build the index again"):
+        locate(built, index, paths, 2, device, progress=False)
 
 
 def test_training_writes_the_bank_that_chose_its_best_checkpoint(tmp_path: Path) -> None:

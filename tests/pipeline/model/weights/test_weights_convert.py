@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pipeline.common.errors import DataError, UsageError, UserError
 from pipeline.config import BackboneConfig, ModelConfig
+from pipeline.model.bank import make_bank
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights import convert
 from pipeline.model.weights.files import load_model, save_model
@@ -156,6 +157,28 @@ def test_onnx_computes_what_torch_computes(small: ModelConfig, tmp_path: Path) -
         model.cross_image.layers[0].linear1.weight.add_(0.1)  # type: ignore[union-attr, operator]
     with pytest.raises(DataError, match="onnxruntime differs from torch by"):
         onnx_export.check(model, file, "descriptors")
+
+
+@onnx_packages
+@pytest.mark.slow
+def test_onnx_beside_a_bank(small: ModelConfig, tmp_path: Path) -> None:
+    """Five images in and five descriptors out, each torch's beside the bank, whose keys and values are constants."""
+    import onnxruntime
+
+    from pipeline.model.weights import onnx_export
+
+    backbone = dataclasses.replace(small.backbone, depth=1)
+    model, file = away_from_start(dataclasses.replace(small, backbone=backbone)), tmp_path / "m.onnx"
+    model.bank = make_bank(torch.randn(6, model.regions, 32), "train")
+    assert onnx_export.export_onnx(model, file) < 1e-5
+    session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    images = torch.randn(5, 3, SIZE, SIZE)
+    (found,) = session.run(None, {"images": images.numpy()})
+    with torch.no_grad():
+        wanted = model.correlate_beside(model.encode(images), model.remember(model.bank))
+        assert torch.allclose(torch.from_numpy(found), wanted, atol=1e-5)
+        assert (wanted - model.correlate(model.encode(images), alone=True)).abs().max() > 1e-3
+    assert model.bank.digest in session.get_modelmeta().custom_metadata_map["groups"]
 
 
 @onnx_packages
