@@ -107,7 +107,7 @@ def lay(
     if wide < 1 or high < 1:
         return
     shrink_x, shrink_y = (
-        min(max(int(size / (max(at) - min(at))), 1), max(size // 4, 1))
+        min(max(int(size / max(max(at) - min(at), 1.0)), 1), max(size // 4, 1))
         for size, at in zip(picture.size, (us, vs), strict=True)
     )
     if max(shrink_x, shrink_y) > 1:  # what would alias

@@ -19,8 +19,8 @@ LEAVES: dict[str, tuple[RGB, RGB, RGB]] = {
     "summer": ((62, 106, 50), (76, 120, 56), (54, 96, 52)),
     "autumn": ((196, 124, 46), (176, 84, 40), (206, 164, 62)),
 }
-EVERGREENS: dict[str, RGB] = {"conifer": (52, 84, 58), "palm": (86, 118, 62)}
-TREES = {"round": 140, "poplar": 76, "palm": 120, "conifer": 90}  # width in pixels of 180 pixels high
+EVERGREENS: dict[str, RGB] = {"conifer": (52, 84, 58), "cypress": (52, 84, 58)}
+TREES = {"round": 140, "poplar": 76, "cypress": 50, "conifer": 90}  # width in pixels of 180 pixels high
 PAINTS: tuple[RGB, ...] = (
     (186, 190, 194), (44, 48, 54), (150, 34, 36), (40, 70, 122), (232, 232, 228),
     (92, 98, 92), (196, 168, 66), (64, 110, 92),
@@ -51,25 +51,12 @@ def tree(species: str, season: str, snow: bool, variant: int) -> Cutout:
     leaf = EVERGREENS.get(species) or LEAVES.get(season, LEAVES["summer"])[variant % 3]
     made, bark, middle = Cutout(wide, high, (84, 72, 62) if bare else leaf), (92, 76, 62), wide / 2
 
-    def branch(x: float, y: float, angle: float, length: float, thick: int, spread: float) -> None:
-        end = x + length * math.cos(angle), y + length * math.sin(angle)
-        made.draw.line((x, y, *end), fill=(226, 230, 236) if snow and thick < 3 else bark, width=thick)
-        if length > 9:
-            for turn in (-1, 1) if length < 20 else (-1, 0.1, 1):
-                bend, shorter = float(rng.uniform(0.6, 1.3)), float(rng.uniform(0.6, 0.78))
-                branch(*end, angle + turn * spread * bend, length * shorter, max(thick - 1, 1), spread)
-
     made.draw.line((middle, high, middle, high * 0.43), fill=bark, width=7)
-    if species == "palm":
-        for a in np.linspace(0.06, 3.08, 13) + rng.normal(0, 0.08, 13):
-            x, y = middle, high * 0.42
-            for step in range(9):
-                end = x + 7.5 * math.cos(a), y - 7.5 * math.sin(a) + step * 1.5
-                made.draw.line((x, y, *end), fill=tone(leaf, 0.75 + 0.05 * step), width=6 - step // 2)
-                x, y = end
-        return made
-    if species != "conifer":
-        branch(middle, high * 0.55, -math.pi / 2, high * 0.17, 5, 0.25 if species == "poplar" else 0.5)
+    for a, r in rng.uniform((-2.6, 0.3), (-0.5, 1), (60, 2)).tolist():  # branches, seen in winter
+        tip = middle + wide * 0.42 * r * math.cos(a), high * 0.55 + high * 0.45 * r * math.sin(a)
+        elbow = (middle + tip[0]) / 2, (high * 0.6 + tip[1]) / 2 - 8 * r
+        twig = (226, 230, 236) if snow else tone(bark, 0.8 + 0.4 * r)
+        made.draw.line((middle, high * 0.62, *elbow, *tip), fill=twig, width=2 if r > 0.6 else 3)
     leaves = 0 if bare else 420
     for k, (a, r, size, shade) in enumerate(rng.uniform((0, 0, 2.6, -0.1), (6.28, 1, 6.4, 0.1), (leaves, 4)).tolist()):
         across, up = math.sqrt(r) * math.cos(a), math.sqrt(r) * math.sin(a)

@@ -21,7 +21,7 @@ from pipeline.common.progress import Progress
 from shards.sources.miniature.photograph import Studio
 from shards.sources.miniature.plan import PlacePhotos, data_frames, plan_photos
 
-FORMAT = 2  # of the pictures: raise it when a change of the drawing changes their bytes
+FORMAT = 3  # of the pictures: raise it when a change of the drawing changes their bytes
 
 
 @dataclass(frozen=True)
@@ -53,19 +53,18 @@ class MiniatureConfig:
         Raises:
             UsageError: a count or size that cannot be.
         """
-        val, test = (
-            max(self.places // share, 2) if n is None else n
-            for n, share in ((self.val_places, 5), (self.test_places, 3))
-        )
-        streets = -(-max(self.places, val, test) // max(self.street_places, 1))
-        for name, value, low, high in (
-            ("places", self.places, 1, None), ("val_places", val, 0, None), ("test_places", test, 0, None),
-            ("street_places", self.street_places, 1, 20), ("width", self.width, 32, 2048),
-            ("height", self.height, 32, 2048), ("workers", 1 if self.workers is None else self.workers, 1, None),
-            ("streets of one split (places / street_places)", streets, 1, 1100),
-        ):  # fmt: skip
-            if value < low or (high is not None and value > high):
-                raise UsageError(f"{name} = {value}: must be {low} " + (f"to {high}" if high else "or more"))
+        val = max(self.places // 5, 2) if self.val_places is None else self.val_places
+        test = max(self.places // 3, 2) if self.test_places is None else self.test_places
+        given = {
+            "places": (self.places, 1, 22_000), "val_places": (val, 0, 22_000), "test_places": (test, 0, 22_000),
+            "street_places": (self.street_places, 1, 20), "width": (self.width, 32, 2048),
+            "height": (self.height, 32, 2048), "workers": (1 if self.workers is None else self.workers, 1, 4096),
+        }  # fmt: skip
+        for name, (value, low, high) in given.items():
+            if not low <= value <= high:
+                raise UsageError(f"{name} = {value}: must be {low} to {high}")
+        if max(self.places, val, test) > 1100 * self.street_places:
+            raise UsageError(f"places = {max(self.places, val, test)}: the map has room for 1100 streets of a split")
         return self.places, val, test
 
 

@@ -49,7 +49,6 @@ class Studio:
         shot.sky()
         shot.skyline()
         shot.ground()
-        shot.shadows()
         steps = shot.things() + shot.traffic()
         for b, slopes in zip(self.place.buildings, self._roofs, strict=True):
             x, z = min(max(camera.x, b.x0), b.x1) - camera.x, min(max(camera.z, b.z0), b.z1) - camera.z
@@ -220,32 +219,8 @@ class Shot:
                 self._strip(at, at + 3, z, z + 0.5, paint)
             for left, right in place.gaps:
                 self._strip(left + 1.5, right - 1.5, k - 0.2, 200, road)
-        top = max(int(self.camera.horizon) - 2, 0)
-        under = self.canvas.crop((0, top, *self.canvas.size))
-        self.canvas.paste(ImageChops.multiply(under, gravel(*under.size)), (0, top))
-
-    def shadows(self) -> None:
-        """What the sun's rays do not reach on the ground: behind houses and the crowns of trees, as boxes."""
-        sun, camera = self.conditions.to_sun, self.camera
-        if float(self.conditions.colours[3].sum()) < 0.5 or sun[1] < 0.2:
-            return
-        mask = Image.new("L", self.canvas.size, 0)
-        draw, dx, dz = ImageDraw.Draw(mask), -float(sun[0] / sun[1]), -float(sun[2] / sun[1])
-        boxes = [(b.x0, b.x1, b.z0, b.z1, 0.0, b.height) for b in self.place.buildings]
-        for t in self.place.things:
-            r = t.size * 0.2
-            if t.kind in cutouts.TREES:
-                boxes.append((t.x - r, t.x + r, t.z - r, t.z + r, t.size * 0.35, t.size * 0.8))
-        for x0, x1, z0, z1, low, high in boxes:
-            if z0 - camera.z > 60 or abs(x0 - camera.x) > 60:
-                continue
-            base = [(x0, z0), (x1, z0), (x1, z1), (x0, z1)]
-            feet, tops = ([(x + dx * h, 0.0, z + dz * h) for x, z in base] for h in (low, high))
-            for patch in (tops, *[[feet[k - 1], feet[k], tops[k], tops[k - 1]] for k in range(4)]):
-                outline = camera.polygon(patch)
-                if outline:
-                    draw.polygon(outline, fill=120)
-        self.canvas.paste((24, 28, 44), mask=mask)
+        under = self.canvas.crop((0, int(self.camera.horizon), *self.canvas.size))
+        self.canvas.paste(ImageChops.multiply(under, gravel(*under.size)), (0, int(self.camera.horizon)))
 
     def lit(self, wall: Wall, facing: np.ndarray, distance: float, rng: np.random.Generator) -> Image.Image:
         """A wall's picture in the photo's light, with snow and lit windows."""

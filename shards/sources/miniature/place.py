@@ -144,20 +144,9 @@ def _landmark(place: Place, rng: np.random.Generator, x: float, z: float) -> Non
     ]
     left = x - nave / 2 - width if rng.random() < 0.5 else x + nave / 2
     family, seed = place.town.families[2], int(rng.integers(1 << 31))
-    church = (x - nave / 2, x + nave / 2, z, z + 16, eaves, family, 1, seed, ("south",), "church")
-    tower = (
-        left,
-        left + width,
-        z - 0.5,
-        z - 0.5 + width,
-        high,
-        family,
-        4,
-        seed + 1,
-        ("south", "west", "east"),
-        "tower",
-    )
-    place.buildings += [Building(*church), Building(*tower)]
+    church = Building(x - nave / 2, x + nave / 2, z, z + 16, eaves, family, 1, seed, ("south",), "church")
+    z, faces = z - 0.5, ("south", "west", "east")
+    place.buildings += [church, Building(left, left + width, z, z + width, high, family, 4, seed + 1, faces, "tower")]
 
 
 def _furnish(place: Place, rng: np.random.Generator) -> None:
