@@ -29,8 +29,9 @@ class MineJob:
     """File to write, about 0.5 kB a place; an older one is replaced when the new one is complete."""
     shards: tuple[str, ...] | str = "data/shards"
     """The shard set, or the list of sets, that will be trained on: the same ones in the same order."""
-    kind: Literal["single", "permuted"] = "single"
-    """single: each image alone; permuted: the same, shuffled among the places of each city, a control."""
+    kind: Literal["single", "bank", "permuted"] = "single"
+    """single: each image alone; bank: beside the bank that was saved with the weights; permuted: single, shuffled among
+    the places of each city, a control."""
     round: int = 0
     """Which round of four images is described."""
     workers: int = 4

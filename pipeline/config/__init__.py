@@ -54,8 +54,9 @@ class DataConfig(Settings):
     """Order of places: in-city batches (as published in effect), mixed over cities, within windows of shards, or
     in-city batches of places that look alike to the model (mined; the first epoch is as city)."""
     mine_from: str = setting("single", changes="numbers")
-    """mined: what tells that places look alike. single: descriptors of each image alone, by the model being trained;
-    permuted: the same, shuffled among the places of each city, a control without hardness; or a file of jobs.mine."""
+    """mined: what tells that places look alike. single: each image alone, by the model being trained; bank: beside its
+    bank; permuted: single, shuffled among the places of each city, a control without hardness; or a file of jobs.mine.
+    """
     mine_every: int = setting(1, changes="numbers", at_least=1)
     """mined: epochs between two minings, the first before the second epoch. Not used with a file."""
     clique: int = setting(6, changes="numbers", at_least=2)

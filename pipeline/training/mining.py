@@ -24,11 +24,12 @@ from pipeline.data.place_descriptors import read_descriptors
 from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import cities_of
 from pipeline.distributed import broadcast_tensors, on_rank_0, rank
+from pipeline.model.cross_image import check_crossing
 from pipeline.model.vpr import PlaceModel
 from pipeline.training.checkpoint import RunState
 from shards.index import ShardIndex
 
-MODEL = ("single", "permuted")  # what the model being trained can mine from
+MODEL = ("single", "bank", "permuted")  # what the model being trained can mine from
 
 
 class Mining:
@@ -49,6 +50,8 @@ class Mining:
         self.data, self.index = config.data, index
         self.folder, self.origin = run / "mined", (origin or run) / "mined"
         check_rule(self.data)
+        if self.data.mine_from == "bank":
+            check_crossing(config.model.cross_image, "data.mine_from bank")
         self.points, self.unknown = place_points(
             index, f"data.mine_radius={self.data.mine_radius:g}", self.data.mine_radius > 0
         )
@@ -64,7 +67,7 @@ class Mining:
         """Makes the file of this epoch and notes it in `state`; removes those that no checkpoint names. Collective.
 
         Args:
-            model: whole, as it is at the epoch's start.
+            model: whole, as it is at the epoch's start, with its bank.
             accelerator: its device and precision.
             stopped: raises where the run was asked to stop; called all along.
         """
@@ -159,6 +162,7 @@ def check_rule(data: DataConfig) -> None:
 
     Raises:
         UsageError: with the values.
+        DataError: on rank 0, a file that is not there.
     """
     if data.clique > data.places_per_batch:
         raise UsageError(
@@ -168,7 +172,7 @@ def check_rule(data: DataConfig) -> None:
     if data.mine_neighbours < data.clique - 1:
         raise UsageError(f"data.mine_neighbours ({data.mine_neighbours}) is fewer than a group needs (data.clique - 1)")
     if data.mine_from not in MODEL and rank() == 0 and not Path(data.mine_from).is_file():
-        raise DataError(f"data.mine_from: {data.mine_from} is neither {' nor '.join(MODEL)} nor a file of jobs.mine")
+        raise DataError(f"data.mine_from: {data.mine_from} is none of {', '.join(MODEL)}, and no file of jobs.mine")
 
 
 def _made_at(epoch: int, every: int) -> int:

@@ -229,7 +229,7 @@ class Trainer:
         if self.mining is None:
             return None
         if self.mining.due(self.state):
-            with self.engine.plain() as model, uncompiled(self.config.train.compile):
+            with self._whole() as model:
                 self.mining.make(self.state, model, self.accelerator, self._stop_unsaved)
         return self.mining.mined(self.state)
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from pipeline import distributed
-from pipeline.common.errors import DataError
+from pipeline.common.errors import DataError, UsageError
 from pipeline.common.progress import Progress
 from pipeline.config import DataConfig
 from pipeline.data.images import normalise
@@ -48,11 +48,12 @@ def describe_places(
     stopped: Callable[[], None] = lambda: None,
     temporary: Path | None = None,
 ) -> PlaceDescriptors | None:
-    """One descriptor a place: the mean of its four images', each alone; PCA; unit length; fp16. Collective.
+    """One descriptor a place: the mean of its four images', each by itself; PCA; unit length; fp16. Collective.
 
     Args:
         data: size of the images, workers and cache.
-        kind: single, or permuted (shuffled among the places of each city: the same shapes, and nothing learnt).
+        kind: single; bank: each image beside the model's bank; permuted: single, shuffled among the places of each
+            city (the same shapes, and nothing to learn).
         turn: the round of images, mod each set's rounds.
         autocast: precision of the backbone.
         stopped: called at each pass on all ranks; what it raises ends the work.
@@ -62,8 +63,11 @@ def describe_places(
         On rank 0 all of them, None elsewhere.
 
     Raises:
+        UsageError: `bank` for a model without one.
         DataError: images that cannot be read, or descriptors that tell nothing; the same on all ranks.
     """
+    if kind == "bank" and model.bank is None:
+        raise UsageError("mining from bank: no bank lies beside these weights; mine from single, or train them anew")
     rows = rows_of_round(index, turn)
     w, total = distributed.world_size(), len(rows)
     steps = -(-total // (PLACES * w))
@@ -87,13 +91,15 @@ def describe_places(
 
     every = distributed.agreed(room, what="making room for descriptors")
     with evaluating(model), Progress("mining: describing places", total, "places", enabled=first) as bar:
+        memory = model.remember(model.bank) if kind == "bank" and model.bank is not None else None
         for step in range(steps):
             stopped()
             batch = distributed.agreed(lambda: next(loader), what="reading places to mine from")
             with autocast():
                 regions = model.encode(normalise(batch.images.to(device, non_blocking=True)))
-            described = model.correlate(regions.float(), alone=True).unflatten(0, (-1, VIEWS)).mean(1)
-            gathered = distributed.gather(described)
+            regions = regions.float()
+            images = model.correlate(regions, alone=True) if memory is None else model.correlate_beside(regions, memory)
+            gathered = distributed.gather(images.unflatten(0, (-1, VIEWS)).mean(1))
             start = step * PLACES * w
             if every is not None:
                 every[start : start + PLACES * w] = gathered[: total - start].half().cpu().numpy()
