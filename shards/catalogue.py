@@ -99,7 +99,7 @@ def build(
     out = list(left_out)
     usable = pc.and_(pc.greater(unique["size"], 0), pc.less_equal(unique["size"], MAX_BYTES))
     for row in unique.filter(pc.invert(usable)).to_pylist():
-        reason = {0: "empty file (0 bytes)", -1: "missing", -2: "cannot be read: no permission"}.get(row["size"])
+        reason = {0: "empty file (0 bytes)", -1: "missing", -2: "cannot be read"}.get(row["size"])
         reason = reason or f"too large: {row['size']:,} bytes, the limit is {MAX_BYTES:,}"
         out.append(LeftOut(row["path"], row["city"], row["place_id"], reason))
     present = unique.filter(usable).combine_chunks()

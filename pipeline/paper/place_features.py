@@ -55,7 +55,8 @@ def choose_places(folder: Path, places: int, images: int, seed: int) -> Photos:
     """
     from shards.sources.registry import read_source
 
-    table = read_source(folder).table
+    catalogue = read_source(folder)
+    table = catalogue.table
     groups: dict[str, list[str]] = {}
     for city, place, path, size in zip(
         *(table[name].to_pylist() for name in ("city", "place_id", "path", "size")), strict=True
@@ -72,7 +73,9 @@ def choose_places(folder: Path, places: int, images: int, seed: int) -> Photos:
     taken = sorted(rng.permutation(len(enough))[:places].tolist())
     names = [enough[i] for i in taken]
     paths = [
-        folder / groups[name][i] for name in names for i in sorted(rng.permutation(len(groups[name]))[:images].tolist())
+        catalogue.root / groups[name][i]
+        for name in names
+        for i in sorted(rng.permutation(len(groups[name]))[:images].tolist())
     ]
     return Photos(paths, np.repeat(np.arange(places), images), names)
 

@@ -84,6 +84,9 @@ def read(root: Path, cities: Sequence[str] = (), cell_m: float = 25.0, heading_d
         remarks.append(
             f"{', '.join(spared)}: the validation cities of MSLS are left out; name them in --cities to train on them"
         )
+    if empty := [city for city in kept if not any((base / city / side / "images").is_dir() for side in SIDES)]:
+        remarks.append(f"no photos of {', '.join(empty)}: there is no images/ in their folders, so they are left out")
+        kept = [city for city in kept if city not in empty]
     tables, panoramas, unheaded, unlisted = [], 0, 0, 0
     for city in kept:
         for side in SIDES:
@@ -105,10 +108,8 @@ def _side(root: Path, folder: Path, city: str, cell_m: float, heading_deg: float
     where = _table(folder, "postprocessed", ("key", "easting", "northing", "view_direction"))
     raw = _table(folder, "raw", ("key", "lon", "lat", "ca", "captured_at", "pano"))
     frames = _table(folder, "seq_info", ("key", "sequence_key", "frame_number"))
+    raw, frames = (_matched(where, t, folder / f"{name}.csv") for t, name in ((raw, "raw"), (frames, "seq_info")))
     keys = where["key"].to_pylist()
-    for name, table in (("raw.csv", raw), ("seq_info.csv", frames)):
-        if table["key"].to_pylist() != keys:
-            raise DataError(f"{shown(folder / name)}: its keys are not those of postprocessed.csv, row by row")
     for row, key in enumerate(keys, 1):
         if not re.fullmatch(r"[\w-]{1,100}", key):
             told = f"row {row}: key is '{shown(key, 60)}', not a photo's name"
@@ -147,6 +148,15 @@ def _table(folder: Path, name: str, columns: Sequence[str]) -> pa.Table:
     return read_frame(path, columns)
 
 
+def _matched(where: pa.Table, table: pa.Table, path: Path) -> pa.Table:
+    """The rows of a table in the order of postprocessed.csv's keys."""
+    rows = pc.index_in(where["key"], value_set=table["key"].combine_chunks())
+    if rows.null_count:
+        key = where["key"][int(np.flatnonzero(rows.is_null().to_numpy())[0])].as_py()
+        raise DataError(f"{shown(path)}: no row with the key '{shown(key, 60)}', which postprocessed.csv names")
+    return table.take(rows)
+
+
 def _headings(
     metres: NDArray[np.float64], sequences: list[str], frame: NDArray[np.int64], views: list[str], compass: Any
 ) -> NDArray[np.float64]:
@@ -165,4 +175,5 @@ def _headings(
     looking = (travel + turn) % 360
     told = pc.cast(pc.if_else(pc.match_substring_regex(compass, r"^-?\d+(\.\d*)?$"), compass, None), pa.float64())
     angle = told.to_numpy() % 360
-    return np.where(np.isfinite(looking), looking, angle)
+    headings: NDArray[np.float64] = np.where(np.isfinite(looking), looking, angle) % 360  # -1e-20 % 360 is 360
+    return headings

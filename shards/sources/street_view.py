@@ -85,9 +85,10 @@ def read_utm(root: Path, cell_m: float = 10.0, heading_deg: float = 30.0) -> Cat
         if heading is None and yaw is not None:
             heading = yaw * yaw_step - (yaw_step if yaw_step > 1 else 0)
             from_yaw += 1
+        heading = heading % 360 % 360 if heading is not None else None  # twice: -1e-20 % 360 is 360
         rows.append(
             {"city": zone, "place_id": cell_name(east, north, cell_m) + sector_name(heading, heading_deg),
-             "path": path, "size": size, "bearing": heading % 360 if heading is not None else None, **_told(fields)}
+             "path": path, "size": size, "bearing": heading, **_told(fields)}
         )  # fmt: skip
     without = len(rows) - from_field
     remarks = []
@@ -116,8 +117,8 @@ def cell_name(east: float, north: float, cell_m: float) -> str:
 
 
 def sector_name(heading: float | None, heading_deg: float) -> str:
-    """The sector of a heading in degrees, to be put behind a cell's name; nothing where headings are not told apart."""
-    return f"_{math.floor(heading % 360 / heading_deg)}" if heading is not None and heading_deg > 0 else ""
+    """The sector of a heading (0 <= heading < 360) behind a cell's name; "" where headings are not told apart."""
+    return f"_{math.floor(heading / heading_deg)}" if heading is not None and heading_deg > 0 else ""
 
 
 def _pictures(root: Path, left_out: list[LeftOut]) -> Iterator[tuple[str, int]]:
