@@ -34,6 +34,8 @@ class CompareJob:
     """MLflow experiment."""
     uri: str | None = None
     """Tracking server or store; none: MLFLOW_TRACKING_URI, else `<output>/mlflow.db`."""
+    figures_also: tuple[Literal["pdf", "svg", "png"], ...] = ()
+    """The curves in these formats as well, for a paper: pdf and svg hold vectors, png has 300 dpi."""
     output: str = "outputs"
     """Folder of the runs; the table (markdown, CSV) and the curves go to `<output>/comparison`."""
 
@@ -46,6 +48,7 @@ def main() -> None:
     if job.evaluations:
         compare_evaluations(job)
         return
+    from pipeline.evaluation.report.figures import also_as
     from pipeline.training import comparison
     from pipeline.training.tracking import store_uri
 
@@ -70,7 +73,9 @@ def main() -> None:
             file.write("\n" + significance.as_markdown(found))
         significance.write_csv(found, folder / "differences.csv")
         written.append(folder / "differences.csv")
-    if comparison.draw_curves(runs, folder / "recall_curves.png"):
+    with also_as(job.figures_also):
+        drawn = comparison.draw_curves(runs, folder / "recall_curves.png")
+    if drawn:
         written.append(folder / "recall_curves.png")
     print("\nwritten: " + "  ".join(str(path) for path in written))
 

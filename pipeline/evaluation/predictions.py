@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.common.errors import DataError
+from pipeline.common.text import shown
 from pipeline.evaluation.evaluate import Result
 from pipeline.evaluation.protocol import Protocol
 from pipeline.evaluation.recall import first_hits
@@ -90,17 +91,18 @@ def load_predictions(path: Path) -> Predictions:
     try:
         table = pq.read_table(path)
         about = json.loads(table.schema.metadata[META])
-    except (OSError, pa.ArrowInvalid, KeyError, TypeError) as error:
-        raise DataError(f"{path}: not a file of predictions ({error}); evaluate again") from None
-    return Predictions(
-        about["set"],
-        Protocol(**about["protocol"]),
-        table["query"].to_pylist(),
-        np.array(table["rows"].to_pylist(), np.int64),
-        np.array(table["distances"].to_pylist(), np.float32),
-        [np.array(p, np.int64) for p in table["positives"].to_pylist()],
-        table["rank"].to_numpy(),
-    )
+        return Predictions(
+            about["set"],
+            Protocol(**about["protocol"]),
+            table["query"].to_pylist(),
+            np.array(table["rows"].to_pylist(), np.int64),
+            np.array(table["distances"].to_pylist(), np.float32),
+            [np.array(p, np.int64) for p in table["positives"].to_pylist()],
+            table["rank"].to_numpy(),
+        )
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError, OverflowError) as error:
+        reason = shown(" ".join(str(error).split()))
+        raise DataError(f"{path}: not a file of predictions ({reason}); evaluate again") from None
 
 
 def _lists(values: np.ndarray | list[np.ndarray]) -> pa.Array:

@@ -287,7 +287,7 @@ def attention_maps(model: Any, photos: Sequence[Path]) -> np.ndarray:
 def attention_overlay(model: Any, photos: Sequence[Path], path: Path, title: str) -> None:
     """Photos above their `attention_maps`, each map scaled to its own range."""
     maps, size = attention_maps(model, photos), int(model.image_size)
-    with canvas(2.0 * len(photos), 4.9, path) as figure:
+    with canvas(2.0 * len(photos), 4.55, path) as figure:
         figure.suptitle(title, x=0.008, ha="left", fontsize=13, fontweight="bold")
         axes = figure.subplots(2, len(photos), squeeze=False)
         for i, photo in enumerate(photos):

@@ -124,7 +124,8 @@ def _read(path: Path) -> list[dict[str, Any]]:
         with path.open(newline="", encoding="utf-8-sig") as file:
             return list(csv.DictReader(file))
     except (OSError, ValueError, csv.Error) as error:
-        raise DataError(f"{path}: not a readable {path.suffix} table ({error})") from error
+        reason = shown(" ".join(str(error).split()))
+        raise DataError(f"{path}: not a readable {path.suffix} table ({reason})") from error
 
 
 def _numbers(path: Path, rows: list[dict[str, Any]], column: str) -> np.ndarray:
@@ -136,7 +137,7 @@ def _numbers(path: Path, rows: list[dict[str, Any]], column: str) -> np.ndarray:
         except (TypeError, ValueError):
             values[at] = np.nan
         if not np.isfinite(values[at]):
-            raise DataError(f"{path}, row {at + 1}: {column} is '{row[column]}', not a number")
+            raise DataError(f"{path}, row {at + 1}: {column} is '{shown(row[column])}', not a number")
     return values
 
 

@@ -107,7 +107,14 @@ def read_strings(path: Path) -> list[str]:
         raise DataError(f"{path}: not a readable .npy array of text ({error})") from error
     if array.ndim != 1 or array.dtype.kind not in "US":
         raise DataError(f"{path}: expected a list of image names, found {array.dtype} {array.shape}")
-    return [name.decode() if isinstance(name, bytes) else str(name) for name in array.tolist()]
+    if array.dtype.kind == "U" and array.size:
+        codes = np.ascontiguousarray(array).view(np.dtype(np.uint32).newbyteorder(array.dtype.byteorder))
+        if int(codes.max()) > 0x10FFFF:  # numpy would make a str of it that Python itself cannot hold
+            raise DataError(f"{path}: its names hold characters that do not exist; the file is damaged")
+    try:
+        return [name.decode() if isinstance(name, bytes) else str(name) for name in array.tolist()]
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: its names are not UTF-8 ({error})") from error
 
 
 def read_ragged(path: Path) -> list[np.ndarray]:

@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from pipeline.common.errors import DataError
 from pipeline.common.text import Table, csv_text, markdown_text, shown
 
 TABLE = Table(
@@ -113,3 +114,8 @@ def test_markdown_shows_markup_as_typed(markup: str) -> None:
 def test_a_name_is_shown_as_one_printable_line(name: object, seen: str) -> None:
     assert shown(name) == seen
     assert shown(name).isprintable()
+
+
+def test_every_error_for_the_user_is_one_printable_line() -> None:
+    error = DataError("a\nname \x1b[31mred\x1b[0m: broken")
+    assert str(error) == r"a\nname \x1b[31mred\x1b[0m: broken" and f"{error}" == str(error)

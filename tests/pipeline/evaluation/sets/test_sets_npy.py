@@ -267,3 +267,17 @@ def test_a_list_names_nothing_outside_its_folder(tmp_path: Path, name: str) -> N
         assert np.load(tmp_path / "s_qImages.npy")[0] == name
     with pytest.raises(DataError, match="is no plain path relative to the photos' folder"):
         load_set(str(tmp_path), EvaluationConfig())
+
+
+def test_names_that_are_no_text_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "u.npy", np.array(["abc", "d"]))
+    content = bytearray((tmp_path / "u.npy").read_bytes())
+    content[-1] = 0x7F  # the highest byte of a character: far above the last one that exists
+    (tmp_path / "u.npy").write_bytes(content)
+    with pytest.raises(DataError, match="characters that do not exist"):
+        read_strings(tmp_path / "u.npy")
+    np.save(tmp_path / "s.npy", np.array([b"\xff\xfe"]))
+    with pytest.raises(DataError, match="not UTF-8"):
+        read_strings(tmp_path / "s.npy")
+    np.save(tmp_path / "b.npy", np.array(["über"]).astype(">U4"))
+    assert read_strings(tmp_path / "b.npy") == ["über"]
