@@ -19,7 +19,7 @@ from pipeline.common.errors import DataError
 from pipeline.common.files import open_ordinary
 from pipeline.common.text import shown
 
-MAX_PIXELS = 1 << 27  # 134 million: more than phones and panoramas have; 400 MB as RGB
+MAX_PIXELS = 1 << 27  # 134 million, such as a panorama of 16,384 x 8,192: 400 MB as RGB
 MAX_BYTES = 1 << 30  # of a photo's file
 MAX_SCANNED = 1 << 31  # pixels times scans of a progressive JPEG, each of which goes over the whole image
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF")  # others, such as EPS, would start other programs

@@ -207,3 +207,10 @@ def test_a_pipe_and_a_program_under_a_photos_name_are_refused(tmp_path: Path) ->
     (tmp_path / "page.jpg").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n")
     with pytest.raises(DataError, match="does not decode"):  # Pillow would start Ghostscript
         load_image(tmp_path / "page.jpg")
+
+
+@pytest.mark.parametrize("kind", ["GIF", "PNG", "WEBP", "TIFF"])
+def test_of_many_frames_the_first_is_the_photo(kind: str) -> None:
+    frames = [Image.new("RGB", (32, 24), (n * 10, 0, 0)) for n in range(20)]
+    data = encoded(frames[5], kind, save_all=True, append_images=frames)
+    assert np.abs(decode(data).astype(int) - (50, 0, 0)).max() <= 3
