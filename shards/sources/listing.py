@@ -34,6 +34,22 @@ def names_in(folder: Path) -> list[str]:
         raise DataError(f"{shown(folder)}: cannot be read ({error.strerror})") from None
 
 
+def walk(root: Path, told: Callable[[OSError], object]) -> Iterator[tuple[str, list[str]]]:
+    """(folder, sorted names of the files in it without debris) of `root` and all below, in sorted order.
+
+    Linked folders are followed, each folder once; `told` is called with the error of each that cannot be read.
+    """
+    visited: set[tuple[int, int]] = set()
+    for folder, below, names in os.walk(root, followlinks=True, onerror=told):
+        at = os.stat(folder)  # noqa: PTH116
+        if (at.st_dev, at.st_ino) in visited:  # a link back up, or a second way to the same photos
+            below.clear()
+            continue
+        visited.add((at.st_dev, at.st_ino))
+        below[:] = sorted(name for name in below if not is_debris(name))
+        yield folder, sorted(name for name in names if not is_debris(name))
+
+
 def files_below(
     root: Path, endings: Sequence[str], refused: Callable[[str, str], None] = lambda folder, why: None
 ) -> Iterator[tuple[str, int]]:
@@ -47,17 +63,10 @@ def files_below(
         where = Path(os.fsdecode(error.filename))
         refused(where.relative_to(root).as_posix(), error.strerror or type(error).__name__)
 
-    visited: set[tuple[int, int]] = set()
-    for folder, below, names in os.walk(root, followlinks=True, onerror=told):
-        at = os.stat(folder)  # noqa: PTH116
-        if (at.st_dev, at.st_ino) in visited:  # a link back up, or a second way to the same photos
-            below.clear()
-            continue
-        visited.add((at.st_dev, at.st_ino))
-        below[:] = sorted(name for name in below if not is_debris(name))
+    for folder, names in walk(root, told):
         inside = Path(folder).relative_to(root).as_posix()
-        for name in sorted(names):
-            if name.lower().endswith(tuple(endings)) and not is_debris(name):
+        for name in names:
+            if name.lower().endswith(tuple(endings)):
                 yield (name if inside == "." else f"{inside}/{name}"), size_of(os.path.join(folder, name))  # noqa: PTH118
 
 

@@ -6,7 +6,6 @@ row of the database, all files listed in the order in which groups are formed. N
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 
 from pipeline.common.errors import DataError
 from pipeline.common.text import shown
+from shards.sources.listing import walk
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png"})
 
@@ -69,23 +69,16 @@ class EvaluationSet:
 def list_images(folder: Path, natural: bool = False) -> list[Path]:
     """All images below `folder` (jpg, jpeg, png in any case), sorted by path as the field does.
 
-    `natural` sorts runs of digits by value, for sequences whose numbers are not zero-padded. Hidden files are
-    skipped, linked folders followed, each once. Raises `DataError` when there are none, or a folder cannot be read.
+    `natural` sorts runs of digits by value, for sequences whose numbers are not zero-padded. Hidden files and
+    debris are skipped, linked folders followed, each once. Raises `DataError` when there are none, or a folder cannot
+    be read.
     """
-    found: list[Path] = []
-    entered: set[tuple[int, int]] = set()
-    for parent, below, names in os.walk(folder, followlinks=True, onerror=_unreadable):
-        state = os.stat(parent)  # noqa: PTH116
-        if (state.st_dev, state.st_ino) in entered:  # a link back up, or a second way to the same photos
-            below.clear()
-            continue
-        entered.add((state.st_dev, state.st_ino))
-        below[:] = sorted(name for name in below if not name.startswith((".", "__MACOSX")))
-        found += [
-            Path(parent, name)
-            for name in names
-            if Path(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith(".")
-        ]
+    found = [
+        Path(parent, name)
+        for parent, names in walk(folder, _unreadable)
+        for name in names
+        if Path(name).suffix.lower() in IMAGE_SUFFIXES
+    ]
     if not found:
         raise DataError(f"{folder}: no jpg, jpeg or png image in this folder or below it")
     return sorted(found, key=_natural if natural else str)
