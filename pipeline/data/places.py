@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -224,7 +224,7 @@ class PlaceLoader:
     def __len__(self) -> int:
         return len(self.plan.batches) - self.start_step
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Generator[Batch]:
         ahead = self._fetch_ahead() if self.cache.remote else None
         try:
             for step, batch in enumerate(workers.batches(self._loader, self.stop), self.start_step):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -80,3 +81,13 @@ def prepare(root: Path, places: int = 24) -> Path:
     command = [sys.executable, "-m", "jobs.prepare", "--source", str(root / "gsv"), "--out", str(root / "shards")]
     subprocess.run([*command, "--rounds", "2"], check=True, capture_output=True)
     return root
+
+
+def samples(root: Path, name: str) -> dict[int, list[str]]:
+    """Step of a run -> the sample keys of the global batch, the logs of all ranks joined in rank order."""
+    steps: dict[int, list[str]] = {}
+    for path in sorted((root / "outputs" / name).glob("samples.rank*.jsonl")):
+        for line in path.read_text().splitlines():
+            entry = json.loads(line)
+            steps.setdefault(entry["step"], []).extend(entry["samples"])
+    return steps

@@ -10,7 +10,7 @@ import dataclasses
 import os
 import tempfile
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +74,7 @@ def describe_places(
     filled = np.append(rows, np.repeat(rows[-1:], steps * PLACES * w - total))
     planned = EpochPlan(filled.reshape(steps, PLACES * w), 0, 0, np.zeros(steps, np.int64))
     unaltered = dataclasses.replace(data, augment="off", order="city")
-    loader = iter(PlaceLoader(index, unaltered, planned, 0, 0, distributed.rank(), w))
+    batches = iter(PlaceLoader(index, unaltered, planned, 0, 0, distributed.rank(), w))
     first = distributed.rank() == 0
 
     def room() -> np.ndarray | None:
@@ -90,7 +90,11 @@ def describe_places(
             return np.memmap(file, np.float16, "r+", shape=(total, model.descriptor_dim))
 
     every = distributed.agreed(room, what="making room for descriptors")
-    with evaluating(model), Progress("mining: describing places", total, "places", enabled=first) as bar:
+    with (
+        evaluating(model),
+        closing(batches) as loader,
+        Progress("mining: describing places", total, "places", enabled=first) as bar,
+    ):
         memory = model.remember(model.bank) if kind == "bank" and model.bank is not None else None
         for step in range(steps):
             stopped()

@@ -13,7 +13,7 @@ import pytest
 import torch
 import yaml
 from launched import Launched
-from tiny import prepare, run_settings
+from tiny import prepare, run_settings, samples
 from tiny_checkpoint import save_tiny
 
 from pipeline.common.errors import DataError, UsageError
@@ -65,16 +65,6 @@ def run(path: Path, world: int, code: int = 0) -> str:
     job = start(path, world)
     assert job.wait() == [code] * world, job.ranks[0].text()[-3000:]
     return job.ranks[0].text()
-
-
-def samples(root: Path, name: str) -> dict[int, list[str]]:
-    """Step -> the samples of the global batch, ranks joined in order."""
-    steps: dict[int, list[str]] = {}
-    for path in sorted((root / "outputs" / name).glob("samples.rank*.jsonl")):
-        for line in path.read_text().splitlines():
-            entry = json.loads(line)
-            steps.setdefault(entry["step"], []).extend(entry["samples"])
-    return steps
 
 
 def states(root: Path, name: str) -> Iterator[dict[str, Any]]:

@@ -16,7 +16,7 @@ import torch
 import yaml
 from job_process import JobProcess
 from safetensors.torch import load_file
-from tiny import prepare, run_settings
+from tiny import prepare, run_settings, samples
 
 
 @pytest.fixture(scope="module")
@@ -69,16 +69,6 @@ def weights(root: Path, name: str, which: str = "last") -> dict[str, torch.Tenso
 
 def same_bits(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
-
-
-def samples(root: Path, name: str) -> dict[int, list[str]]:
-    """Step -> the sample keys of the global batch, from all ranks' logs."""
-    steps: dict[int, list[str]] = {}
-    for path in sorted((root / "outputs" / name).glob("samples.rank*.jsonl")):
-        for line in path.read_text().splitlines():
-            entry = json.loads(line)
-            steps.setdefault(entry["step"], []).extend(entry["samples"])
-    return steps
 
 
 @pytest.fixture(scope="module")

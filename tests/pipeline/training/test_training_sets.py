@@ -11,7 +11,7 @@ import pytest
 import yaml
 from launched import Launched
 from safetensors.torch import load_file
-from tiny import make_gsv, prepare, run_settings
+from tiny import make_gsv, prepare, run_settings, samples
 
 from jobs.prepare import main as prepare_job
 
@@ -40,16 +40,6 @@ def run(path: Path, world: int = 1, code: int = 0) -> str:
     job = Launched("ddp", world, "jobs.train", ["--config", str(path)], path.with_suffix(".log"))
     assert job.wait() == [code] * world, job.ranks[0].text()[-3000:]
     return job.ranks[0].text()
-
-
-def samples(root: Path, name: str) -> dict[int, list[str]]:
-    """Step -> the samples of the global batch, ranks joined in order."""
-    steps: dict[int, list[str]] = {}
-    for path in sorted((root / "outputs" / name).glob("samples.rank*.jsonl")):
-        for line in path.read_text().splitlines():
-            entry = json.loads(line)
-            steps.setdefault(entry["step"], []).extend(entry["samples"])
-    return steps
 
 
 def test_two_sets_on_two_ranks_killed_and_resumed(root: Path) -> None:
