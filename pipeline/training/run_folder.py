@@ -10,12 +10,14 @@ from __future__ import annotations
 import errno
 import json
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from pipeline.common.errors import DataError, Diverged, Interrupted, Preempted, UsageError, UserError, told
@@ -24,6 +26,7 @@ from pipeline.distributed import held_on_rank_0, lost, rank, world_size
 
 STATUS, LOCK = "status.json", ".lock"
 ROOM = 4096  # bytes of the file: a block of the disk
+STOPS = (signal.SIGTERM, signal.SIGUSR1)  # a scheduler's
 ENDING = 10.0  # seconds that a former training, told to stop, may take to leave the folder
 _STATES = {Diverged: "diverged", Preempted: "preempted", Interrupted: "interrupted"}
 
@@ -75,19 +78,40 @@ def working_in(run: Path) -> Iterator[Status]:
     """
     with held_on_rank_0(lambda: _held(run), what=f"opening the run's folder {run}"):
         status = Status(pid=os.getpid(), world_size=world_size(), started=_now())
-        try:
-            yield status
-        except BaseException as error:
+
+        def leave(number: int, frame: FrameType | None) -> None:
+            """A signal while there is nothing to save: the training loop has a handler of its own."""
+            error = Preempted(f"signal {number} outside of the training steps: nothing to save; start again")
             status.end(error)
-            raise
-        else:
-            status.end(None)
+            _tell(run, status)
+            os._exit(error.exit_code)
+
+        before = {number: signal.signal(number, leave) for number in STOPS}
+        try:
+            try:
+                yield status
+                error = None
+            except BaseException as raised:
+                error = raised
+            for number in STOPS:  # a launcher stops its other ranks: this one is ending already
+                signal.signal(number, signal.SIG_IGN)
+            status.end(error)
+            _tell(run, status)
+            if error is not None:
+                raise error
         finally:
-            if rank() == 0:
-                try:
-                    _write(run / STATUS, status)
-                except OSError as error:
-                    print(f"warning: {run / STATUS} cannot be written: {error}", file=sys.stderr, flush=True)
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def _tell(run: Path, status: Status) -> None:
+    """Rank 0 writes; that the file cannot be written does not change how the run ended."""
+    if rank() != 0:
+        return
+    try:
+        _write(run / STATUS, status)
+    except OSError as error:
+        print(f"warning: {run / STATUS} cannot be written: {error}", file=sys.stderr, flush=True)
 
 
 def read_status(run: Path) -> dict[str, Any]:

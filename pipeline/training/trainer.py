@@ -169,21 +169,21 @@ class Trainer:
             self.mining.adopt(self.state)
             self.mining.tell()
         status = "FAILED"
-        try:
-            with stop_signals() as self.stops:
+        with stop_signals() as self.stops:  # until the records are closed: a launcher ends the ranks of a failed job
+            try:
                 if self.state.step == 0 and self.validation is not None and self.config.train.validate_first:
                     self._validate()
                 while not self._ended():
                     self._epoch()
-            status = "FINISHED"
-            return Outcome(self.run, self.state, self._ended())
-        except (Preempted, Interrupted, KeyboardInterrupt):
-            status = "KILLED"
-            raise
-        finally:
-            if self.samples is not None:
-                self.samples.close()
-            self.tracker.close(status)
+                status = "FINISHED"
+                return Outcome(self.run, self.state, self._ended())
+            except (Preempted, Interrupted, KeyboardInterrupt):
+                status = "KILLED"
+                raise
+            finally:
+                if self.samples is not None:
+                    self.samples.close()
+                self.tracker.close(status)
 
     def _epoch(self) -> None:
         """The rest of the current epoch, then validation and a checkpoint."""
