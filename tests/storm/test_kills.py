@@ -85,6 +85,10 @@ class Work:
             self.tally.kills += 1
         else:
             self.tally.ended_before += 1
+        time.sleep(0.1)  # a launcher looks ten times a second, and ends the other ranks of a job that lost one
+        for process in job.ranks:
+            if struck and process.alive():
+                process.send(signal.SIGTERM)
         for process in job.ranks:
             try:
                 process.wait(60)

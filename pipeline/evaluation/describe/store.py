@@ -120,7 +120,13 @@ class StoreWriter:
         ).replace_schema_metadata({META: json.dumps(self._about)})
         fresh = self._part(number).with_suffix(".tmp")
         # descriptors neither compress nor repeat: plain pages are smaller in time and no larger on disk
-        pq.write_table(table, fresh, compression="none", use_dictionary=False, write_statistics=["row"])
+        try:
+            pq.write_table(table, fresh, compression="none", use_dictionary=False, write_statistics=["row"])
+        except OSError as error:
+            fresh.unlink(missing_ok=True)  # a full disk has room again
+            raise DataError(
+                f"{self.folder}: descriptors cannot be written ({error}); finished parts are kept"
+            ) from error
         fresh.replace(self._part(number))
         self.done |= {number}
 

@@ -256,8 +256,9 @@ def test_a_kill_while_fetching_leaves_nothing_wrong(served: ShardIndex, tmp_path
     process.wait()
     (left,) = (tmp_path / "cache").rglob("*.part")
     _Server.delay = 0.0
-    # the room it had taken is free again, for any shard
+    # the room it had taken is free again, for the same shard and for any other
     cache = ShardCache(served, tmp_path / "cache", limit)
+    assert cache.fetch(left.stem).read_bytes() == (tmp_path / "set" / left.stem).read_bytes()
     other = next(name for name in cache.shards if name != left.stem)
     assert cache.fetch(other).read_bytes() == (tmp_path / "set" / other).read_bytes()
     assert not left.exists()

@@ -190,6 +190,52 @@ def test_faults_on_one_rank_end_both_alike(root: Path, monkeypatch: pytest.Monke
     assert all(torch.isfinite(t).all() for t in load_file(left / "last/model.safetensors").values())
 
 
+def test_faults_of_an_evaluation_end_both_alike(root: Path, tmp_path: Path) -> None:
+    """A full disk under the descriptor store (rank 0) and under the regions' file (rank 1), a broken photo (rank 1)."""
+    photos = tmp_path / "broken"
+    shutil.copytree(root / "evaluation", photos)
+    broken = sorted((photos / "images/val/database").iterdir())[5]  # batches of four: the second is rank 1's
+    broken.write_bytes(broken.read_bytes()[:200])
+
+    def faults() -> dict[str, tuple[int, str, float]]:
+        from pipeline.evaluation.describe import encode
+        from pipeline.evaluation.evaluate import evaluate
+        from pipeline.evaluation.sets.load import load_set
+        from pipeline.model.vpr import build_model
+
+        config = EvaluationConfig(groups=("shuffled",), group_size=4, batch=4, workers=0, split="val", store="fp32")
+        model = build_model(from_dict(ModelConfig, run_settings(root)["model"]), 28)
+        found: dict[str, tuple[int, str, float]] = {}
+
+        def attempt(name: str, folder: Path, limited: bool) -> None:
+            start = time.perf_counter()
+            code, message = 0, ""
+            with small_files(100) if limited else _nothing():
+                try:
+                    evaluate(model, [load_set(str(folder), config)], config, "cpu", tmp_path / name, progress=False)
+                except UserError as error:
+                    code, message = error.exit_code, str(error)
+            found[name] = (code, message, time.perf_counter() - start)
+
+        attempt("store", root / "evaluation", rank() == 0)
+        kept, encode.REGIONS_IN_MEMORY = encode.REGIONS_IN_MEMORY, 0
+        attempt("regions", root / "evaluation", rank() == 1)
+        encode.REGIONS_IN_MEMORY = kept
+        attempt("photo", photos, False)
+        attempt("none", root / "evaluation", False)
+        return found
+
+    zero, one = run_ranks(faults, 2)
+    for name, (code, message, seconds) in zero.items():
+        print(f"evaluation, {name}: codes [{code}, {one[name][0]}], {max(seconds, one[name][2]):.2f} s: {message}")
+        assert one[name][:2] == (code, message)
+    assert [zero[name][0] for name in ("store", "regions", "photo", "none")] == [3, 3, 3, 0]
+    assert zero["store"][1].startswith(f"rank 0: {tmp_path}/store/descriptors/") and "too large" in zero["store"][1]
+    assert not list((tmp_path / "store").rglob("*.tmp"))
+    assert zero["regions"][1].startswith("rank 1: ") and "regions.1.bin" in zero["regions"][1]
+    assert broken.name in zero["photo"][1]
+
+
 def test_disks_of_two_machines(root: Path) -> None:
     """Rank 1 sees another output folder, as on a disk of its own machine: rank 0 reads the checkpoint and sends it."""
 

@@ -175,6 +175,7 @@ def test_user_mistakes_are_one_line(root: Path) -> None:
         (["--data.shards", str(root / "nowhere")], 3, "nowhere"),
         (["--data.places_per_batch", "400"], 2, "400"),
         (["--validate.sets", f"[{root / 'missing'}]"], 3, "missing"),
+        (["--output", str(path / "x")], 2, f"{path}/x/mistakes: the run's folder cannot be written (Not a directory)"),
     ]
     for overrides, code, wanted in cases:
         out = train(path, *overrides, code=code)
