@@ -26,7 +26,7 @@ class ExperimentJob(RunConfig):
 
     table: str = ""
     """ablation_crica, ablation_adaptation, dimensions, epochs, encoder_layers, train_batch, inference_batch, kernels,
-    spm, same_data, or parts, mined (ours)."""
+    spm, same_data, or parts, mined, one_photo (ours; the last with paired intervals between rows)."""
     seeds: tuple[int, ...] = (0,)
     """A training of every row with each seed, as `0,1,2`: mean and standard deviation are shown."""
     sets: tuple[str, ...] = ()

@@ -18,7 +18,7 @@ from pipeline.evaluation.sets.registry import published_name
 from pipeline.paper import values
 from pipeline.paper.study import Study
 
-COLOURS = dict(zip(("single", "shuffled", "ordered"), CURVES, strict=False))
+COLOURS = dict(zip(("single", "shuffled", "ordered", "bank"), CURVES, strict=False))
 
 
 def draw(study: Study, path: Path) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 from pipeline.config import EvaluationConfig, from_dict, to_dict
 from pipeline.evaluation.evaluate import Result, evaluate, fit_projections, model_fingerprint
+from pipeline.evaluation.predictions import save_predictions
 from pipeline.evaluation.report import tables
 from pipeline.evaluation.sets.load import load_set
 from pipeline.model.weights.files import checkpoint_file, load_model, read_metadata
@@ -29,6 +30,11 @@ def folder(run: Path) -> Path:
 def results_file(run: Path, cell: Cell) -> Path:
     """The results of one evaluation."""
     return folder(run) / f"{cell.key}.json"
+
+
+def predictions_folder(run: Path, cell: Cell) -> Path:
+    """What was answered to each query, for paired intervals between rows."""
+    return folder(run) / cell.key
 
 
 def write_order(run: Path, cells: Sequence[Cell]) -> Path:
@@ -62,6 +68,8 @@ def measure(order: Path, accelerator: Any) -> None:
         sets = [load_set(name, config) for name in config.sets]
         results = evaluate(model, sets, config, accelerator.device, output, True, projections, fingerprint)
         if accelerator.is_main_process:
+            for result in results:
+                save_predictions(result, next(s for s in sets if s.name == result.set_name), output / key)
             _keep(run, output / f"{key}.json", file, config, results)
     if accelerator.is_main_process:
         # descriptors were kept only so that several PCAs need not describe the images again

@@ -130,7 +130,7 @@ def evaluation(
         descriptor_dim: of the row's model, for PCA in proportion.
     """
     size = row.group if row.group is not None else paper_numbers.group_size(published)
-    groups = base.groups
+    groups = row.groups or base.groups
     if row.group == 1:
         groups = ("single",)  # a group of one is an image alone, in any order
     elif row.group is not None:
@@ -199,6 +199,8 @@ def _label(config: RunConfig, base: RunConfig) -> str:
         parts.append(f"steps{config.train.steps}")
     elif config.train.epochs != base.train.epochs:
         parts.append(f"epochs{config.train.epochs}")
+    if config.train.passes != base.train.passes:
+        parts.append(config.train.passes)
     return "-".join(parts)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from pipeline.common.errors import UsageError
 
@@ -33,6 +33,8 @@ class Row:
     """Evaluation: dimensions kept by PCA, of the paper's 10752."""
     group: int | None = None
     """Evaluation: images that share an inference batch; None: the paper's, 8 on Pittsburgh and 16 elsewhere."""
+    groups: tuple[Literal["single", "shuffled", "ordered", "bank"], ...] = ()
+    """Evaluation: groupings; empty: those of the configuration."""
     paper: tuple[str, str] | None = None
     """(table, row) of the paper that stands beside it; None: the row of the same name in the table of the same name."""
     needs: str = ""
@@ -55,6 +57,11 @@ class Table:
     """The sets of the paper's table."""
     series: tuple[str, ...] = ()
     """Endings of row names that are lines of their own in the figure."""
+    paired: tuple[tuple[tuple[str, str], tuple[str, str]], ...] = ()
+    """Pairs of (row, grouping) whose difference is given with an interval over their common queries."""
+
+
+EVERY_GROUPING: tuple[Literal["single", "shuffled", "ordered", "bank"], ...] = ("single", "shuffled", "ordered", "bank")
 
 
 def _named(*names: str) -> dict[str, Row]:
@@ -154,6 +161,24 @@ TABLES: dict[str, Table] = {
             "CricaVPR on Pitts30k": Row(needs="pitts30k_shards", paper=("", "CricaVPR*")),
         },
         sets=("pitts30k", "pitts250k", "msls_val"),
+    ),
+    "one_photo": Table(
+        "One photo is enough (a table of ours)",
+        {
+            "group": Row(changes={"train.passes": "group"}, groups=EVERY_GROUPING),
+            "alone": Row(changes={"model.cross_image.alone": True}, groups=("single",)),
+            "joint": Row(changes={"train.passes": "joint"}, groups=EVERY_GROUPING),
+        },
+        paired=(
+            (("group", "single"), ("group", "bank")),
+            (("group", "single"), ("joint", "single")),
+            (("alone", "single"), ("joint", "single")),
+            (("joint", "single"), ("joint", "bank")),
+            (("group", "bank"), ("joint", "bank")),
+            (("group", "shuffled"), ("joint", "single")),
+            (("group", "ordered"), ("joint", "single")),
+            (("group", "ordered"), ("joint", "bank")),
+        ),
     ),
     "parts": Table(
         "What each part is worth (a table of ours)",

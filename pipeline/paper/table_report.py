@@ -12,12 +12,14 @@ from pathlib import Path
 
 from pipeline.common.text import Table, csv_text, markdown_text, printable
 from pipeline.evaluation.sets.registry import published_name
+from pipeline.paper import paired
 from pipeline.paper.chart import draw
 from pipeline.paper.study import Study
 from pipeline.paper.values import by_row, paper_figure, paper_set, value
 
 SHOWN = (1, 5)
 """The N of Recall@N in the printed table; the CSV has all."""
+PAIRED = "Differences on the same queries, percentage points; intervals over queries, mean over seeds"
 
 
 def table(study: Study, set_name: str) -> Table:
@@ -96,6 +98,9 @@ def show(study: Study) -> None:
     for set_name in study.sets:
         print("\n" + printable(heading(study, set_name)))
         table(study, set_name).print()
+    if compared := list(paired.paired(study)):
+        print(f"\n{PAIRED}")
+        paired.table(compared).print()
     print("\n" + "\n".join(map(printable, notes(study))))
 
 
@@ -104,14 +109,18 @@ def markdown(study: Study) -> str:
     out = [f"# {study.table.title}", ""]
     for set_name in study.sets:
         out += [markdown_text(heading(study, set_name)), "", table(study, set_name).markdown()]
+    if compared := list(paired.paired(study)):
+        out += [PAIRED, "", paired.table(compared).markdown()]
     return "\n".join([*out, *(f"- {markdown_text(note)}" for note in notes(study))]) + "\n"
 
 
 def write(study: Study, folder: Path) -> None:
-    """`table.md`, `table.csv` (one line a row, set, protocol and N) and `table.png` in `folder`."""
+    """`table.md`, `table.csv` (one line a row, set, protocol and N), `table.png`, and `paired.csv` in `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "table.md").write_text(markdown(study))
     (folder / "table.csv").write_text(csv_text(_long_form(study)))
+    if compared := list(paired.paired(study)):
+        (folder / "paired.csv").write_text(paired.csv(compared))
     draw(study, folder / "table.png")
 
 

@@ -24,7 +24,7 @@ from pipeline.config.model import BackboneConfig
 from pipeline.evaluation.report import paper_numbers
 from pipeline.model.variants import VARIANTS, variant
 from pipeline.paper import plan, study, table_report, values
-from pipeline.paper.rows import TABLES, Row, table
+from pipeline.paper.rows import EVERY_GROUPING, TABLES, Row, table
 from pipeline.paper.runner import Runner
 
 ASKED = (
@@ -229,6 +229,15 @@ def test_pca_beyond_the_database_is_said_and_left_out(root: Path) -> None:
     assert len(filled.trainings) == 1 and "has a database of 16" in filled.notes["1024"]
 
 
+def test_one_photo_asks_of_each_row_what_it_can_do(root: Path) -> None:
+    filled = built(root, "one_photo", groups=("ordered",))
+    asked = {cell.row: cell.config.groups for cell in filled.cells}
+    assert asked == {"group": EVERY_GROUPING, "alone": ("single",), "joint": EVERY_GROUPING}
+    names = [each.name for each in filled.trainings]
+    assert len({name.split("-")[0] for name in names}) == 2 and "-joint-" in names[2] and len(set(names)) == 3
+    assert all(pair[0] in asked and pair[1] in asked[pair[0]] for pairs in TABLES["one_photo"].paired for pair in pairs)
+
+
 @pytest.mark.slow
 def test_a_stopped_table_leaves_with_75_and_continues(root: Path) -> None:
     settings(root, epochs=40, save_every=2)
@@ -246,12 +255,22 @@ def test_a_stopped_table_leaves_with_75_and_continues(root: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*ASKED, "parts", "mined"])
+@pytest.mark.parametrize("name", [*ASKED, "parts", "mined", "one_photo"])
 @pytest.mark.timeout(1800)
 def test_every_table_runs_to_its_end(root: Path, name: str) -> None:
     settings(root)
-    run(root, name, *(["--data.clique", "2", "--train.epochs", "2"] if name == "mined" else []))
+    options = {
+        "mined": ["--data.clique", "2", "--train.epochs", "2"],
+        "one_photo": ["--evaluate.bank", "8", "--seeds", "0,1"],
+    }
+    run(root, name, *options.get(name, []))
     rows = list(csv.DictReader((root / f"outputs/tables/{name}/table.csv").open()))
     left_out = {"dimensions": {"1024", "2048", "4096"}, "same_data": {"CricaVPR on Pitts30k"}}.get(name, set())
     assert {row["row"] for row in rows} == set(TABLES[name].rows) - left_out
     assert all(0 <= float(row["mean"]) <= 100 for row in rows)
+    if name == "one_photo":
+        compared = list(csv.DictReader((root / "outputs/tables/one_photo/paired.csv").open()))
+        assert len(compared) == 2 * len(TABLES[name].paired) and {row["queries"] for row in compared} == {"8"}
+        means = {(row["row"], row["protocol"].split("_")[0], row["n"]): float(row["mean"]) for row in rows}
+        joint = next(row for row in compared if (row["first"], row["second"]) == ("alone single", "joint single"))
+        assert float(joint["recall_second"]) == pytest.approx(means["joint", "single", joint["n"]])

@@ -66,9 +66,21 @@ class Difference:
 
 def paired_interval(gained: int, lost: int, queries: int, seed: int = 0, samples: int = SAMPLES) -> tuple[float, float]:
     """The 95 % percentile interval, in points, of `100 * (gained - lost) / queries` under resampling of the queries."""
-    shares = np.array([gained, lost, queries - gained - lost]) / queries
-    drawn = np.random.Generator(np.random.PCG64(seed)).multinomial(queries, shares, samples)
-    low, high = np.quantile(drawn[:, 0] - drawn[:, 1], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return _interval(np.array([1.0, -1.0, 0.0]), np.array([gained, lost, queries - gained - lost]), seed, samples)
+
+
+def interval_of(differences: np.ndarray, seed: int = 0, samples: int = SAMPLES) -> tuple[float, float]:
+    """The 95 % percentile interval, in points, of 100 times the mean of per-query differences [Q], each -1 to 1 (the
+    mean over several trainings, for example), under resampling of the queries."""
+    values, counts = np.unique(np.round(differences, 12), return_counts=True)
+    return _interval(values, counts, seed, samples)
+
+
+def _interval(values: np.ndarray, counts: np.ndarray, seed: int, samples: int) -> tuple[float, float]:
+    """Of queries with `counts` [n] of each of the differences `values` [n]."""
+    queries = int(counts.sum())
+    drawn = np.random.Generator(np.random.PCG64(seed)).multinomial(queries, counts / queries, samples)
+    low, high = np.quantile(drawn @ values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return 100.0 * float(low) / queries, 100.0 * float(high) / queries
 
 

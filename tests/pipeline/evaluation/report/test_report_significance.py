@@ -19,6 +19,7 @@ from pipeline.evaluation.report.significance import (
     as_text,
     compare_folders,
     differences,
+    interval_of,
     mcnemar,
     paired_interval,
     write_csv,
@@ -54,6 +55,11 @@ def test_equal_to_resampling_the_queries_themselves() -> None:
     error = 100 * math.sqrt((shares.sum() - (shares[0] - shares[1]) ** 2) / queries)  # of a mean of paired differences
     assert (high - low) / 2 == pytest.approx(1.96 * error, rel=0.05)
     assert paired_interval(gained, lost, queries) == (low, high) != paired_interval(gained, lost, queries, seed=1)
+    # a difference a query, as of one training; and the mean over three trainings
+    assert interval_of(change) == pytest.approx((low, high), abs=0.2)
+    thirds = rng.integers(-3, 4, queries) / 3
+    plain = [100 * thirds[rng.integers(0, queries, queries)].mean() for _ in range(10_000)]
+    assert interval_of(thirds) == pytest.approx(np.quantile(plain, [0.025, 0.975]), abs=0.3)
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
