@@ -9,6 +9,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from torch import Tensor
 from pipeline.benchmark.sizes import Size, batch, build
 from pipeline.benchmark.timing import Comparison, clock, compare, from_seconds
 from pipeline.config import TrainConfig
+from pipeline.model.bank import make_bank
 from pipeline.model.vpr import PlaceModel
 from pipeline.training.loss import MultiSimilarityLoss
 from pipeline.training.schedule import build_optimizer
@@ -75,6 +77,7 @@ def measure(size: Size, device: torch.device, rounds: int, images: int, full: bo
         ),
         parts(step, rounds, images),
         inference(step, rounds, images),
+        contexts(step, rounds, images),
     ]  # fmt: skip
     chunk = min(size.chunk, max(1, images // 2))
     found.append(
@@ -130,6 +133,30 @@ def inference(step: Step, rounds: int, images: int) -> Comparison:
 
     ways = {"float32": way(None), "bf16 autocast": way(torch.bfloat16)}
     return compare(f"inference, {images} images", ways, images, rounds, step.device)
+
+
+def contexts(step: Step, rounds: int, images: int) -> Comparison:
+    """Descriptors of images in one group, each alone, and each beside a bank of 64; float32, backbone included."""
+    model = step.model.eval()
+    with torch.inference_mode():
+        bank = make_bank(torch.randn(64, model.regions, model.pooling.dim), "train")
+        memory = model.remember(bank)
+
+    def way(correlate: Callable[[Tensor], Tensor]) -> Callable[[], None]:
+        def run() -> None:
+            model.eval()
+            with torch.inference_mode():
+                correlate(model.encode(step.images))
+            model.train()
+
+        return run
+
+    ways = {
+        "in one group": way(model.correlate),
+        "each alone": way(partial(model.correlate, alone=True)),
+        "beside a bank of 64": way(partial(model.correlate_beside, memory=memory)),
+    }
+    return compare(f"inference by context, {images} images", ways, images, rounds, step.device)
 
 
 def compiled(size: Size, step: Step, rounds: int, images: int) -> Comparison:
