@@ -27,7 +27,8 @@ SET = "miniature"
 GROUPS = {
     "single": "each photo is described alone, as a robot with one photo must",
     "shuffled": "random groups of 16 test photos",
-    "ordered": "16 neighbours in file order, often of one place (what published recalls do)",
+    "ordered": "16 neighbours in file order, often of one place, as published recalls are measured",
+    "bank": "each photo beside the same 64 training photos: also for one photo alone",
 }
 
 
