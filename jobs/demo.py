@@ -44,9 +44,9 @@ class Row:
 
 ROWS = (
     # an image's descriptor does not depend on its group here
-    Row("no-encoder", "without the cross-image encoder", ("--model.cross_image.layers", "0"), ("single",)),
-    Row("published", "with it, trained as published", ("--train.passes", "group")),
-    Row("ours", "with it, trained for groups and single photos", ("--train.passes", "joint")),
+    Row("no-encoder", "no cross-image encoder", ("--model.cross_image.layers", "0"), ("single",)),
+    Row("published", "cross-image encoder, as published", ("--train.passes", "group")),
+    Row("ours", "cross-image encoder, joint training", ("--train.passes", "joint")),
 )
 
 
@@ -222,7 +222,7 @@ def ending(out: Path, seconds: float) -> None:
         marked += [
             (k, column + 2) for k, value in enumerate(values) if value == max(values) and protocol in found[ROWS[k].run]
         ]
-    head = ["model", "cross-image encoder", *protocols, "training, val R@5"]
+    head = ["run", "model", *protocols, "training, val R@5"]
     print(f"\nDone in {seconds / 60:.1f} minutes. R@1 / R@5 in percent, on places that no model has seen:\n")
     Table(head, cells, left=(0, 1), marked=marked).print()
     print()
