@@ -313,10 +313,10 @@ def lay_over(axes: Any, pixels: np.ndarray, heat: np.ndarray, **style: Any) -> N
 
 def photo_tile(axes: Any, photo: Path, tile: tuple[int, int], colour: str, text: str, note: str) -> None:
     """A photo fitted into the tile, in a frame of its colour, with a label above and a note below."""
-    from PIL import Image
+    from PIL import Image, ImageOps
 
     image = load_image(photo)
-    image.thumbnail(tile, Image.Resampling.LANCZOS)
+    image = ImageOps.contain(image, tile, Image.Resampling.LANCZOS)  # enlarges small photos too
     shown = Image.new("RGB", tile, "#f1f3f5")
     shown.paste(image, ((tile[0] - image.width) // 2, (tile[1] - image.height) // 2))
     axes.imshow(np.asarray(shown), aspect="auto", interpolation="antialiased")

@@ -255,3 +255,13 @@ def test_names_that_are_markup_stay_names(street: EvaluationSet, tmp_path: Path)
         assert "\x1b" not in text
     tables.write_csv(results, tmp_path / "r.csv")
     assert "\x1b" not in (tmp_path / "r.csv").read_text()
+
+
+def test_a_photo_smaller_than_its_tile_is_enlarged_to_it(tmp_path: Path) -> None:
+    """A tile has 585 pixels; the drawn city's photos have 320 and were shown with a wide grey margin."""
+    from matplotlib.figure import Figure
+
+    Image.new("RGB", (32, 24), (200, 30, 30)).save(tmp_path / "small.png")
+    axes = Figure().subplots()
+    figures.photo_tile(axes, tmp_path / "small.png", (64, 48), figures.INK, "query", "")
+    assert np.abs(np.asarray(axes.images[0].get_array()).astype(int) - (200, 30, 30)).max() <= 2
