@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import fsspec
+import pyarrow as pa
 import pytest
 
-from pipeline.common.errors import DataError
+from pipeline.common.errors import DataError, UsageError
 from shards import index, schema
 from shards.sources.registry import read_source
 from shards.writer import WriteRule, write_shards
@@ -114,6 +116,31 @@ def test_no_folder_and_nonsense_are_told(tmp_path: Path) -> None:
         assert index.verify(str(tmp_path))
         with pytest.raises(DataError):
             index.read_index(str(tmp_path))
+
+
+def test_what_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
+    """A file system that nobody knows, a pipe in the place of a file (reading it would never end)."""
+    with pytest.raises(UsageError, match="nosuch://bucket/set: cannot be opened"):
+        index.read_index("nosuch://bucket/set")
+    os.mkfifo(tmp_path / schema.MANIFEST)
+    with pytest.raises(DataError, match="is not an ordinary file"):
+        index.read_index(str(tmp_path))
+    assert "is not an ordinary file" in index.verify(str(tmp_path))[0]
+
+
+def test_verify_finds_an_index_that_leads_to_other_members(shard_set: Path) -> None:
+    """Sealed again with good hashes: two samples of a shard exchange their places, and nothing else is wrong."""
+    opened = index.read_index(str(shard_set))
+    rows = opened.table.to_pylist()
+    first, second = [row for row in rows if row["shard"] == rows[0]["shard"]][:2]
+    for name in ("offsets", "sizes", "json_offset", "json_size"):
+        first[name], second[name] = second[name], first[name]
+    raw = index.index_bytes(pa.Table.from_pylist(rows, schema=schema.SCHEMA))
+    (shard_set / schema.INDEX).write_bytes(raw)
+    sealed = schema.sealed_manifest({**opened.manifest, "index_sha256": schema.sha256(raw)})
+    (shard_set / schema.MANIFEST).write_bytes(sealed)
+    (problem,) = index.verify(str(shard_set))
+    assert problem.startswith(f"{rows[0]['shard']}: index.parquet leads to 00000")
 
 
 def test_a_set_behind_a_url_is_read_and_verified(shard_set: Path) -> None:
