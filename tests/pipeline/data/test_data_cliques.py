@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 from collections.abc import Callable
+from contextlib import nullcontext
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,13 +14,17 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from processes import run_ranks
 
 from pipeline.common.errors import DataError
+from pipeline.config import BackboneConfig, CrossImageConfig, DataConfig, ModelConfig
 from pipeline.data.cliques import CliqueRule, Mined, cliques, mine
 from pipeline.data.keyed import random
 from pipeline.data.place_descriptors import PlaceDescriptors, read_descriptors
 from pipeline.data.plan import plan
 from pipeline.data.shard_sets import cities_of, join
+from pipeline.evaluation.describe.places import describe_places
+from pipeline.model.vpr import build_model
 from shards.index import ShardIndex
 
 Make = Callable[..., ShardIndex]
@@ -165,3 +170,20 @@ def test_a_place_without_a_descriptor_is_refused(wrong: float) -> None:
     values[3] = wrong
     with pytest.raises(DataError, match=r"1 of 5 places .* place 3"):
         PlaceDescriptors(values, "", "single", "", 0)
+
+
+def test_a_photo_that_breaks_on_rank_1_ends_mining_on_all_ranks(tmp_path: Path, make_set: Make) -> None:
+    """Ranks describe 8 places each in turn, so place 10 is rank 1's; nobody waits for it."""
+    index = make_set(tmp_path / "set", [20], damage="000010.2.jpg")
+    backbone = BackboneConfig(name="custom", dim=16, depth=1, heads=2, patch=7, pretrain_grid=4)
+    config = ModelConfig(backbone=backbone, cross_image=CrossImageConfig(layers=1, heads=2, feedforward=16))
+    model = build_model(config, 28)
+
+    def work() -> str:
+        data = DataConfig(image_size=28, workers=0)
+        with pytest.raises(DataError) as error:
+            describe_places(model, index, data, "single", 0, torch.device("cpu"), nullcontext, temporary=tmp_path)
+        return str(error.value)
+
+    told = run_ranks(work, 2)
+    assert told[0] == told[1] and "rank 1: " in told[0] and "member 000010.2.jpg" in told[0]
