@@ -47,7 +47,8 @@ def find_cities(root: Path) -> Path | None:
         cities = [name for name in names_in(base) if any((base / name / side / "images").is_dir() for side in SIDES)]
         if any((base / city / side / "postprocessed.csv").is_file() for city in cities for side in SIDES):
             return base
-        if cities and base.name.lower() == "train_val":
+        both = [city for city in cities if all((base / city / side / "images").is_dir() for side in SIDES)]
+        if both or (cities and base.name.lower() == "train_val"):
             raise UsageError(
                 f"{shown(base / cities[0])}: has Mapillary SLS's photos but no postprocessed.csv; extract its "
                 f"metadata.zip into {shown(base.parent)}"
@@ -56,6 +57,8 @@ def find_cities(root: Path) -> Path | None:
         raise UsageError(
             f"{shown(root)}: is one city of Mapillary SLS; give --source {shown(root.parent)} --cities {root.name}"
         )
+    if (root / "postprocessed.csv").is_file() or all((root / side / "images").is_dir() for side in SIDES):
+        raise UsageError(f"{shown(root)}: is a part of a city of Mapillary SLS; give the folder that holds the cities")
     return None
 
 

@@ -95,6 +95,8 @@ def test_a_part_of_the_layout_is_named(msls: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"is one city .*--cities trondheim"):
         detect(msls / "train_val" / "trondheim")
     city = msls / "train_val" / "trondheim"
+    with pytest.raises(UsageError, match=r"is a part of a city .* give the folder that holds the cities"):
+        detect(city / "database")
     (city / "database" / "seq_info.csv").unlink()
     with pytest.raises(DataError, match=r"seq_info\.csv: missing; extract .*metadata\.zip"):
         read_source(msls)
@@ -102,6 +104,10 @@ def test_a_part_of_the_layout_is_named(msls: Path, tmp_path: Path) -> None:
         table.unlink()
     with pytest.raises(UsageError, match=r"no postprocessed\.csv; extract its metadata\.zip into"):
         read_source(msls)
+    (msls / "train_val").rename(msls / "photos")
+    for part, told in (("photos", r"no postprocessed\.csv"), ("photos/trondheim", "is a part of a city")):
+        with pytest.raises(UsageError, match=told):
+            read_source(msls / part)
 
 
 @pytest.mark.parametrize(
