@@ -92,8 +92,10 @@ def read_index(root: str) -> ShardIndex:
     files = _Files(root)
     try:
         raw = files.read(MANIFEST)
-    except FileNotFoundError:
+    except FileNotFoundError as error:
         hint = "unfinished: run the same jobs.prepare command again" if files.has(UNFINISHED) else "not a shard set"
+        if isinstance(error.__cause__, Exception):  # how a URL that cannot be reached is told
+            hint += f", or {_line(error.__cause__)}"
         raise DataError(f"{root}: no {MANIFEST} there ({hint}; shard sets are made by jobs.prepare)") from None
     try:
         index = files.read(INDEX)
