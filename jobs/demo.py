@@ -233,7 +233,10 @@ def ending(out: Path, seconds: float) -> None:
     for path in [*sorted((out / "images").glob("*")), *sorted(out.glob("comparison/*.png")), *reports]:
         print(f"  {path}")
     print("\nEvery run, curve and checkpoint in MLflow, then http://localhost:5000:")
-    print(f"  .venv/bin/mlflow ui --backend-store-uri sqlite:///{out}/mlflow.db")
+    from pipeline.training.tracking import how_to_open
+
+    where = how_to_open(f"sqlite:///{out}/mlflow.db")
+    print("  " + where.replace(" mlflow ui", " .venv/bin/mlflow ui"))
 
 
 if __name__ == "__main__":

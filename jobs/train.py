@@ -1,17 +1,18 @@
 """Train one run, or continue it: accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.train --config FILE
 
 Also runs without the launcher, in one process: `python -m jobs.train --config FILE --data.places_per_batch 16`.
-The same command continues a run that was killed. `--dry-run` prints the plan and exits. Exit codes: `common.errors`;
+The same command continues a run that was killed. `--dry_run` prints the plan and exits. Exit codes: `common.errors`;
 note that `accelerate launch` itself turns any of them but 0 into 1, so `<run>/status.json` tells them too.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import sys
 from dataclasses import dataclass
 
 from jobs.cli import parse, run_job
-from pipeline.config import RunConfig, to_dict
+from pipeline.config import RunConfig, changed
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,14 @@ def main() -> None:
     with launched(config.train.timeout) as accelerator:
         first = accelerator.is_main_process
         if first:
-            import yaml
-
-            print(yaml.safe_dump(to_dict(config), sort_keys=False), flush=True)
+            told = [f"  {name}: {value}" for name, value in changed(config, RunConfig()).items()]
+            print("\n".join(["settings that differ from the defaults:", *told]), flush=True)
+            if config.model.trainable != "full" and config.model.backbone.weights is None:
+                print(
+                    "warning: model.backbone.weights is not set, so the part of the backbone that model.trainable "
+                    f"'{config.model.trainable}' leaves frozen is random numbers; give it released weights",
+                    file=sys.stderr,
+                )
         if job.dry_run:
             from pipeline.training.dry_run import preview, show
 
@@ -45,7 +51,11 @@ def main() -> None:
 
         outcome = train(config, accelerator)
         if first:
+            from pipeline.training.run_log import draw
+
+            picture = draw(outcome.run)
             print(f"{outcome.run}: {outcome}", flush=True)
+            print(f"see {outcome.run / 'train.log'}" + (f" and {picture}" if picture else ""), flush=True)
 
 
 if __name__ == "__main__":

@@ -288,6 +288,12 @@ def flatten(config: Any) -> dict[str, Any]:
     return flat
 
 
+def changed(config: Any, default: Any) -> dict[str, Any]:
+    """Dotted name -> value of the settings in which a config differs from another."""
+    before = flatten(default)
+    return {name: value for name, value in flatten(config).items() if value != before.get(name)}
+
+
 def from_dict(kind: type, values: Any, where: str = "", base: Any = None) -> Any:
     """Builds dataclass `kind` from plain values, as in a checkpoint, also one written under a setting's former name.
 

@@ -51,6 +51,8 @@ def load_runs(uri: str, experiment: str, wanted: Sequence[str] = ()) -> list[Run
     Raises:
         UsageError: no such experiment, no such run (the known ones are listed), or nothing recorded.
     """
+    if uri.startswith("sqlite:///") and not Path(uri.removeprefix("sqlite:///")).is_file():
+        raise UsageError(f"{uri.removeprefix('sqlite:///')}: there is no record of runs; give --output or --uri")
     client = open_client(uri)
     found = client.get_experiment_by_name(experiment)
     if found is None:

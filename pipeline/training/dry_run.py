@@ -1,4 +1,4 @@
-"""What a run would be, before it starts: batches, steps, parameters, memory, disk (`jobs.train --dry-run`).
+"""What a run would be, before it starts: batches, steps, parameters, memory, disk (`jobs.train --dry_run`).
 
 Invariant: nothing is written. Counts are exact; activation memory is measured on one small batch of the real model
 (bytes that autograd keeps for backward) and scaled to the run's batch, so it is an estimate and is called one.
@@ -6,6 +6,7 @@ Invariant: nothing is written. Counts are exact; activation memory is measured o
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -50,7 +51,10 @@ def preview(config: RunConfig) -> list[tuple[str, str]]:
     index = agreed(lambda: open_shards(config.data), what=f"reading {config.data.shards}")
     rows = _plan_rows(config, index)
     torch.manual_seed(config.seed)
-    model = agreed(lambda: build_model(config.model, config.data.image_size), what="building the model")
+    shapes = replace(
+        config.model, backbone=replace(config.model.backbone, weights=None)
+    )  # no file of weights is needed
+    model = agreed(lambda: build_model(shapes, config.data.image_size), what="building the model")
     counts = parameter_counts(model)
     rows += [
         ("descriptor", f"{model.regions} regions x {model.pooling.dim} = {model.descriptor_dim} dimensions"),

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit, urlunsplit
 
 from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig, flatten, to_dict
@@ -50,6 +52,32 @@ def open_client(uri: str) -> Any:
         return client
     except (MlflowException, OSError) as error:
         raise UsageError(f"the MLflow store {uri} cannot be used: {str(error).splitlines()[0]}") from error
+
+
+def how_to_open(uri: str, experiment: str = "", run: str = "") -> str:
+    """How a person sees the records: the address of a server, or the command that serves a local store and then that.
+
+    MLflow's job execution would start seven helper processes, which outlive a SIGTERM; nothing here needs them.
+    """
+    page = f"/#/experiments/{experiment}" + (f"/runs/{run}" if run else "") if experiment else ""
+    if uri.startswith("http"):
+        at = urlsplit(uri)  # without a name and password that may stand in it
+        return urlunsplit((at.scheme, at.netloc.rpartition("@")[2], at.path.rstrip("/"), "", "")) + page
+    command = f"MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false mlflow ui --workers 1 --backend-store-uri {uri}"
+    return f"{command}     then http://localhost:5000{page}"
+
+
+def code_commit() -> str:
+    """The commit of this code, with "-dirty" where files differ from it; "" outside a git checkout."""
+    here = Path(__file__).parent
+    try:
+        commit = subprocess.run(
+            ["git", "-C", str(here), "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"],
+            capture_output=True, text=True, timeout=10, check=True,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return commit.stdout.strip()
 
 
 def experiment_id(client: Any, uri: str, name: str, output: str) -> str:
@@ -118,15 +146,30 @@ class Tracker:
     def _begin(self) -> None:
         from mlflow.entities import Param
 
-        run = self._client.create_run(
-            self._experiment, run_name=self.config.name, tags={"run_folder": str(self._folder()), "kind": "training"}
-        )
+        run = self._client.create_run(self._experiment, run_name=self.config.name, tags=self._tags())
         self.run_id = run.info.run_id
         values = [Param(key, str(value)) for key, value in flatten(self.config).items()]
         for first in range(0, len(values), 100):  # MLflow takes at most 100 a call
             self._client.log_batch(self.run_id, params=values[first : first + 100])
         self._client.log_dict(self.run_id, to_dict(self.config), "config.yaml")
         self._client.log_dict(self.run_id, environment(), "environment.yaml")
+
+    def _tags(self) -> dict[str, str]:
+        """What the MLflow page shows of a run beside its numbers: a description, and the code's commit."""
+        config, folder = self.config, self._folder()
+        shards = config.data.shards if isinstance(config.data.shards, str) else ", ".join(config.data.shards)
+        about = (
+            f"**{config.name}**: {config.model.backbone.name}, trained on {shards}, {config.data.places_per_batch} "
+            f"places in a batch, order {config.data.order}.\n\nAgain: `python -m jobs.train --config "
+            f"{folder / 'config.json'} --name NEW_NAME`"
+        )
+        commit = code_commit()
+        tags = {"run_folder": str(folder), "kind": "training", "mlflow.note.content": about}
+        return tags | ({"mlflow.source.git.commit": commit} if commit else {})
+
+    def where(self) -> str:
+        """How a person sees this run; "" where it is not recorded."""
+        return "" if self._client is None else how_to_open(self.uri, self._experiment, self.run_id)
 
     def _folder(self) -> Path:
         return Path(self.config.output) / self.config.name

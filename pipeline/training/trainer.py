@@ -51,6 +51,7 @@ from pipeline.training.loss import MultiSimilarityLoss
 from pipeline.training.meter import Meter
 from pipeline.training.mining import Mining
 from pipeline.training.run_folder import working_in
+from pipeline.training.run_log import RunLog
 from pipeline.training.schedule import build_optimizer, learning_rate
 from pipeline.training.tracking import Tracker
 from pipeline.training.validation import Validation
@@ -282,7 +283,7 @@ class Trainer:
         meter.record(value, mined.by_pass, mined.negatives)
         if state.step % config.train.log_every == 0 or state.step == self.total_steps:
             report = meter.report()
-            self.tracker.metrics(
+            self._record(
                 {
                     "train/loss": report.loss,
                     **mined_metrics(report.mined),
@@ -302,7 +303,7 @@ class Trainer:
         with self._whole() as model:
             values, score = self.validation.run(model, self.main)
         self.state.validated, self.state.validated_step = values, self.state.step
-        self.tracker.metrics(values, self.state.step)
+        self._record(values, self.state.step)
         if self.state.step == 0:
             self.state.start = values
             return
@@ -318,6 +319,12 @@ class Trainer:
             model.bank = self.training_bank.encode(model)
             self.bank = (self.state.step, model.bank)
             yield model
+
+    def _record(self, values: dict[str, float], step: int) -> None:
+        """Metrics of a step, in MLflow and in `train.log`; on rank 0."""
+        self.tracker.metrics(values, step)
+        if self.log is not None:
+            self.log.write(values, step)
 
     def _save(self) -> None:
         """One checkpoint (collective): whole tensors are gathered on rank 0, which writes."""
@@ -397,6 +404,9 @@ class Trainer:
             self.tracker = Tracker(config, known, config.tracking.enabled)
             self.state.run_id = self.tracker.run_id
             note.write_text(self.tracker.run_id)
+            self.log = RunLog(self.run, self.state.step)
+            if where := self.tracker.where():
+                print(f"recorded in MLflow: {where}", file=sys.stderr, flush=True)
 
         def open_log() -> None:
             log = self.run / f"samples.rank{rank()}.jsonl"
