@@ -505,6 +505,8 @@ def check_batch(config: RunConfig, steps_per_epoch: int) -> None:
     places, w = config.data.places_per_batch, world_size()
     if config.train.passes == "joint":
         check_crossing(config.model.cross_image, "train.passes joint")
+    if config.validate.sets and "bank" in config.validate.groups:
+        check_crossing(config.model.cross_image, "validate.groups bank")
     if places % w:
         raise UsageError(
             f"data.places_per_batch {places} cannot be cut equally over {w} processes; use a multiple of {w}"

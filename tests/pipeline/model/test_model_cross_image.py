@@ -10,7 +10,7 @@ from processes import run_ranks
 from torch import Tensor, nn
 
 from pipeline.common.errors import UsageError
-from pipeline.config import CrossImageConfig, ModelConfig, RunConfig, TrainConfig
+from pipeline.config import CrossImageConfig, EvaluationConfig, ModelConfig, RunConfig, TrainConfig
 from pipeline.distributed import rank_slice
 from pipeline.model.cross_image import CrossImageEncoder
 from pipeline.training.trainer import check_batch
@@ -106,6 +106,9 @@ def test_what_needs_other_images_is_refused_without(config: CrossImageConfig, re
     run = RunConfig(model=ModelConfig(cross_image=config), train=TrainConfig(passes="joint"))
     with pytest.raises(UsageError, match=f"train.passes joint .*{reason}"):
         check_batch(run, 1)
+    beside = EvaluationConfig(sets=("city",), groups=("bank",))
+    with pytest.raises(UsageError, match=f"validate.groups bank .*{reason}"):
+        check_batch(replace(run, train=TrainConfig(), validate=beside), 1)
     check_batch(replace(run, train=TrainConfig()), 1)
 
 

@@ -130,6 +130,13 @@ def test_a_descriptor_depends_on_no_other_image_nor_process_nor_engine(photos: E
 
 
 def test_draws_files_and_names(tmp_path: Path, photos: EvaluationSet) -> None:
+    built, folder = model(), photos.database[0].parent
+    wanted = EvaluationConfig(groups=("bank",), bank=4, bank_from=str(folder))
+    with evaluating(built):  # a folder's photos, drawn as a map's are
+        own = chosen_bank(built, wanted, [], "cpu")
+        map_ = chosen_bank(built, dataclasses.replace(wanted, bank_from="map"), photos.database, "cpu")
+    assert own is not None and map_ is not None and own.digest == map_.digest and len(own.regions) == 4
+    assert (own.source, map_.source) == (folder.name, "map")
     assert list(drawn(50, 8, 3)) == list(drawn(50, 20, 3)[:8]) != list(drawn(50, 8, 4))
     assert sorted(drawn(5, 64, 0)) == list(range(5))
     bank = make_bank(torch.randn(6, 5, 16), "train")
