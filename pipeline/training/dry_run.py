@@ -82,7 +82,11 @@ def _plan_rows(config: RunConfig, index: ShardIndex) -> list[tuple[str, str]]:
         ),
         ("global batch", f"{data.places_per_batch} places x 4 = {images} images, order {data.order}"),
         ("processes", f"{w}, {images // w} images each"),
-        *([("mining", Mining(config, index, Path(config.output)).told())] if data.order == "mined" else []),
+        *(
+            [("mining", agreed(lambda: Mining(config, index, Path(config.output))).told())]
+            if data.order == "mined"
+            else []
+        ),
         ("epoch", f"{steps:,} steps; {first.left_over:,} places wait for another epoch"),
         ("run", f"{limited:,} steps in {config.train.epochs} epochs, {limited * images:,} images"),
     ]
