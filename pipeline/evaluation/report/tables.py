@@ -46,7 +46,7 @@ def table(results: Sequence[Result]) -> Table:
                     marked.add((len(rows), f"R@{k}"))
             row["queries"] = f"{result.queries:,}"
             row["database"] = f"{result.database:,}"
-            row["no positive"] = f"{result.without_positives:,}"
+            row["no positive"] = f"{result.without_positives:,}" if result.recalls else "-"
             row["paper R@1/5/10"] = _cells(paper)
             rows.append(row)
         headline = reported(set_name)
@@ -78,12 +78,12 @@ def show(results: Sequence[Result]) -> None:
 def notes(results: Sequence[Result]) -> list[str]:
     """What the short names of protocols mean, which queries have no positive, and remarks: each once."""
     lines: dict[str, None] = {}
-    if any(len(group) > 1 for _, group in _by_set(results)):
+    if any(len([r for r in group if r.recalls]) > 1 for _, group in _by_set(results)):
         lines["the best of each set is marked; recalls in percent"] = None
     for result in results:
         lines[f"{result.protocol.name}: {result.protocol.describe()}"] = None
     for result in results:
-        if result.without_positives:
+        if result.without_positives and result.recalls:
             done = "counted as misses" if result.protocol.without_positives == "miss" else "dropped"
             lines[f"{result.set_name}: {result.without_positives:,} queries have no positive and are {done}"] = None
         for remark in result.remarks:

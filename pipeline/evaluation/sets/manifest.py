@@ -33,11 +33,11 @@ def from_manifest(path: Path, config: EvaluationConfig) -> EvaluationSet:
     columns = rows[0].keys()
     for column in ("image", "role"):
         if column not in columns:
-            raise DataError(f"{path}: no column '{column}'; it has {', '.join(columns)}")
+            raise DataError(f"{path}: no column '{column}'; it has {shown(', '.join(columns))}")
     split: dict[str, list[int]] = {"database": [], "query": []}
     for at, row in enumerate(rows):
         if row["role"] not in split:
-            raise DataError(f"{path}, row {at + 1}: role is '{row['role']}'; it can be database or query")
+            raise DataError(f"{path}, row {at + 1}: role is '{shown(row['role'])}'; it can be database or query")
         split[row["role"]].append(at)
     database, queries = ([rows[at] for at in split[role]] for role in ("database", "query"))
     photos = [existing([path.parent / str(row["image"]) for row in side], str(path)) for side in (database, queries)]
@@ -59,7 +59,8 @@ def from_manifest(path: Path, config: EvaluationConfig) -> EvaluationSet:
         positives, rule = within_radius(of_database, of_queries, config.radius), f"{config.radius:g} m"
     else:
         raise DataError(
-            f"{path}: needs positives, frame, utm_east and utm_north, or lat and lon; it has {', '.join(columns)}"
+            f"{path}: needs positives, frame, utm_east and utm_north, or lat and lon; it has "
+            f"{shown(', '.join(columns))}"
         )
     return EvaluationSet(
         clean_name(path.stem), photos[0], photos[1], positives, rule, of_database, of_queries, remarks=remarks
@@ -122,10 +123,14 @@ def _read(path: Path) -> list[dict[str, Any]]:
 
             return list(parquet.read_table(path).to_pylist())
         with path.open(newline="", encoding="utf-8-sig") as file:
-            return list(csv.DictReader(file))
+            rows: list[dict[str, Any]] = list(csv.DictReader(file))
     except (OSError, ValueError, csv.Error) as error:
         reason = shown(" ".join(str(error).split()))
         raise DataError(f"{path}: not a readable {path.suffix} table ({reason})") from error
+    long = next((at for at, row in enumerate(rows) if None in row), None)
+    if long is not None:
+        raise DataError(f"{path}, row {long + 1}: has more cells than the first line has columns")
+    return rows
 
 
 def _numbers(path: Path, rows: list[dict[str, Any]], column: str) -> np.ndarray:
@@ -177,7 +182,8 @@ def _listed(path: Path, database: list[dict[str, Any]], queries: list[dict[str, 
         unknown = [name for name in names if name not in row_of]
         if unknown:
             raise DataError(
-                f"{path}: positive '{unknown[0]}' of query '{row['image']}' is no database image of this file"
+                f"{path}: positive '{shown(unknown[0])}' of query '{shown(row['image'])}' is no database image of "
+                "this file"
             )
         positives.append(np.array(sorted({row_of[name] for name in names}), np.int64))
     return positives

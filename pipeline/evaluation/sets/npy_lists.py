@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.common.errors import DataError
+from pipeline.common.text import shown
 
 
 class _Dtype:
@@ -99,12 +100,23 @@ class _Unpickler(pickle.Unpickler):
         raise pickle.UnpicklingError("it refers to objects outside the file")
 
 
-def read_strings(path: Path) -> list[str]:
-    """A one-dimensional `.npy` array of text (image names). Raises `DataError` for anything else."""
+def _plain(path: Path, what: str) -> np.ndarray:
+    """An array without objects in it. Raises `DataError` for anything else."""
     try:
         array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{path}: not a readable .npy array of text ({error})") from error
+        if isinstance(array, np.ndarray):
+            return array
+        reason = "an archive of arrays"
+    except OSError as error:
+        reason = error.strerror or str(error)
+    except Exception as error:  # numpy parses the header as Python: a damaged one raises SyntaxError, TokenError ...
+        reason = " ".join(str(error).split()) or type(error).__name__
+    raise DataError(f"{path}: not a readable .npy array of {what} ({shown(reason)})")
+
+
+def read_strings(path: Path) -> list[str]:
+    """A one-dimensional `.npy` array of text (image names). Raises `DataError` for anything else."""
+    array = _plain(path, "text")
     if array.ndim != 1 or array.dtype.kind not in "US":
         raise DataError(f"{path}: expected a list of image names, found {array.dtype} {array.shape}")
     if array.dtype.kind == "U" and array.size:
@@ -147,10 +159,7 @@ def read_ragged(path: Path) -> list[np.ndarray]:
 
 def read_indices(path: Path) -> np.ndarray:
     """A one-dimensional `.npy` array of integers, as int64. Raises `DataError` for anything else."""
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{path}: not a readable .npy array of integers ({error})") from error
+    array = _plain(path, "integers")
     if array.ndim != 1 or array.dtype.kind not in "iu":
         raise DataError(f"{path}: expected a list of integers, found {array.dtype} {array.shape}")
     return array.astype(np.int64)

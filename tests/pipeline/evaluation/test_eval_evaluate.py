@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,12 @@ def test_model_mode_and_random_state_are_left_as_they_were(tmp_path: Path) -> No
     assert model.training and torch.equal(before, torch.get_rng_state())
 
 
+def bomb() -> bytes:
+    """A PNG of a few bytes whose header says 60,000 x 60,000 pixels."""
+    chunks = (b"IHDR" + (60_000).to_bytes(4) * 2 + b"\x08\x02\0\0\0", b"IDAT" + zlib.compress(bytes(99)), b"IEND")
+    return b"\x89PNG\r\n\x1a\n" + b"".join((len(c) - 4).to_bytes(4) + c + zlib.crc32(c).to_bytes(4) for c in chunks)
+
+
 @pytest.mark.parametrize("workers", [0, 2])
 def test_a_broken_image_is_named(tmp_path: Path, workers: int) -> None:
     evaluated = make_set(tmp_path)
@@ -120,10 +127,12 @@ def test_a_broken_image_is_named(tmp_path: Path, workers: int) -> None:
     broken = [*evaluated.database[5:30:4], *evaluated.queries[2:6]]  # both sides, in many batches
     for number, photo in enumerate(broken):
         photo.write_bytes(b"") if number % 2 else photo.unlink()
+    broken[0].write_bytes(bomb())
     with pytest.raises(DataError, match=r"12 broken photos: .*; and 2 more\. Restore the files") as caught:
         evaluate(Tiny(), [evaluated], dataclasses.replace(CONFIG, workers=workers), "cpu", progress=False)
     named = [photo for photo in broken if str(photo) in str(caught.value)]
     assert len(named) == 9 and "020.png" in str(caught.value), "the first ten in the set's order"
+    assert "too large: 3,600,000,000 pixels" in str(caught.value)
 
 
 def test_parts_are_searched_apart(tmp_path: Path) -> None:

@@ -163,6 +163,8 @@ def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
     sets = [street, sequence, unscored]
     results = [result for evaluated in sets for result in results_of(evaluated, config)]
     assert results[2].recalls == {}
+    assert tables.table(results[2:]).rows[0][-2:] == ["30", "-"]
+    assert not any("no positive and are" in note or "best" in note for note in tables.notes(results[2:]))
     pictures = draw(results, sets, tmp_path / "figures", Corner())
     drawn = {p.path.name for p in pictures}
     assert drawn >= {"pitts30k.curves.png", "seq.single.errors.png", "seq.single.worst.jpg", "seq.attention.jpg"}
