@@ -145,7 +145,7 @@ def expected(job: DemoJob) -> str:
     )
 
 
-STARTS = 4.0  # starts of a process that a row costs, with its files, figures and records
+STARTS = 6.0  # starts of a process that a row costs, with its files, figures and records
 
 
 def measure() -> None:
