@@ -232,7 +232,7 @@ def ending(out: Path, seconds: float) -> None:
     reports = [out / row.run / "evaluation" / "report.html" for row in ROWS]
     for path in [*sorted((out / "images").glob("*")), *sorted(out.glob("comparison/*.png")), *reports]:
         print(f"  {path}")
-    print("\nEvery run, curve and checkpoint in MLflow, then http://localhost:5000:")
+    print("\nEvery run, curve and checkpoint in MLflow:")
     from pipeline.training.tracking import how_to_open
 
     where = how_to_open(f"sqlite:///{out}/mlflow.db")

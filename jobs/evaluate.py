@@ -63,6 +63,8 @@ def main() -> None:
         raise UsageError("--dimensions goes with --from_store; with a checkpoint give --pca")
     if not job.checkpoint:
         raise UsageError("--checkpoint is missing: a run folder such as outputs/cricavpr, or a model file")
+    if not Path(job.checkpoint).exists():  # before seconds of imports
+        raise UsageError(f"{job.checkpoint}: no model there, there is no such file or folder")
     from pipeline.training.launch import launched
 
     with launched(job.timeout) as accelerator:
