@@ -2,7 +2,7 @@
 
 Invariant: one training at a time works in a folder. `status.json` says "running" from the first moment, and how it
 ended afterwards; a run that was killed leaves "running" behind, and `state_of` tells the difference by the lock. The
-file has its room on the disk from the start, so that its end can be written where a full disk was the cause.
+room for its end is taken on the disk from the start, since a full disk may be the cause of that end.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pipeline.common.files import locked
 from pipeline.distributed import held_on_rank_0, lost, rank, world_size
 
 STATUS, LOCK = "status.json", ".lock"
-ROOM = 4096  # bytes of the file: a block of the disk
+ROOM = ".room"  # a file of some kB that is removed to write the end of a run that a full disk ended
 STOPS = (signal.SIGTERM, signal.SIGUSR1)  # a scheduler's
 ENDING = 10.0  # seconds that a former training, told to stop, may take to leave the folder
 _STATES = {Diverged: "diverged", Preempted: "preempted", Interrupted: "interrupted"}
@@ -147,6 +147,7 @@ def _held(run: Path) -> Iterator[None]:
     try:
         try:
             _write(run / STATUS, Status(pid=os.getpid(), world_size=world_size(), started=_now()))
+            (run / ROOM).write_bytes(bytes(16_384))
         except OSError as error:
             raise _refused(run, error) from error
         yield
@@ -161,22 +162,15 @@ def _refused(run: Path, error: OSError) -> UserError:
 
 
 def _write(path: Path, status: Status) -> None:
-    """Whole or not at all where the disk has room for a second file; else over the first, which has its room."""
-    text = json.dumps(asdict(status), indent=1)
-    if len(text.encode()) >= ROOM:
-        status = Status(**{**asdict(status), "message": status.message[: ROOM // 8] + " ..."})
-        text = json.dumps(asdict(status), indent=1)
-    padded = (text + "\n").encode().ljust(ROOM)
+    """Whole or not at all."""
+    path.with_name(ROOM).unlink(missing_ok=True)  # on a full disk, the room for what follows
     temporary = path.with_name(f".status-{os.getpid()}")
     try:
-        temporary.write_bytes(padded)
+        temporary.write_text(json.dumps(asdict(status), indent=1) + "\n")
         temporary.replace(path)
     except OSError:
         temporary.unlink(missing_ok=True)
-        if not path.exists():
-            raise
-        with path.open("r+b") as file:
-            file.write(padded)
+        raise
 
 
 def _now() -> str:

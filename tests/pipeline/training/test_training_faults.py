@@ -468,3 +468,20 @@ def test_what_a_launcher_was_asked_for() -> None:
     assert asked_processes(line.replace("num_processes 2", "num-processes=4").split()) == 4
     assert asked_processes(["accelerate", "launch", "-m", "jobs.train", "--num_processes", "9"]) is None
     assert asked_processes(["bash", "-c", "x", "--num_processes", "2"]) is None
+
+
+def test_status_tells_the_end_on_a_full_disk(tmp_path: Path) -> None:
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(tmp_path)], check=False).returncode:
+        pytest.skip("needs the right to mount a small disk")
+    try:
+        with (
+            pytest.raises(OSError, match="No space left"),
+            run_folder.working_in(tmp_path / "run"),
+            (tmp_path / "fill").open("wb", buffering=0) as file,
+        ):
+            while True:
+                file.write(bytes(4096))
+        status = run_folder.read_status(tmp_path / "run")
+        assert (status["state"], status["exit_code"]) == ("failed", 3) and "No space left" in status["message"]
+    finally:
+        subprocess.run(["umount", str(tmp_path)], check=True)
