@@ -8,15 +8,10 @@ import numpy as np
 import pytest
 import torch
 from processes import run_ranks
-from tiny import photo
+from street import model, street
 
 from pipeline.config import (
-    AdapterConfig,
-    BackboneConfig,
-    CrossImageConfig,
     EvaluationConfig,
-    ModelConfig,
-    PoolingConfig,
 )
 from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.describe import encode
@@ -25,29 +20,11 @@ from pipeline.evaluation.describe.sides import Engine
 from pipeline.evaluation.evaluate import evaluating
 from pipeline.evaluation.protocol import protocols
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
-from pipeline.model.vpr import PlaceModel, build_model
-
-
-def model() -> PlaceModel:
-    torch.manual_seed(3)
-    config = ModelConfig(
-        backbone=BackboneConfig(name="custom", dim=16, depth=1, heads=2, patch=7, pretrain_grid=4),
-        adapter=AdapterConfig(reduced=2),
-        pooling=PoolingConfig(levels=(1, 2)),
-        cross_image=CrossImageConfig(layers=2, heads=2, feedforward=16),
-    )
-    built = build_model(config, 28)
-    for parameter in built.cross_image.parameters():  # every one of them matters
-        torch.nn.init.normal_(parameter, std=0.3)
-    return built
 
 
 @pytest.fixture
 def photos(tmp_path: Path) -> EvaluationSet:
-    paths = [tmp_path / f"{i:02d}.jpg" for i in range(23)]
-    for i, path in enumerate(paths):
-        photo(i, 0).save(path)
-    return EvaluationSet("street", paths, paths[:1], [np.zeros(1, np.int64)], "pairs")
+    return street(tmp_path)
 
 
 def described(photos: EvaluationSet) -> np.ndarray:

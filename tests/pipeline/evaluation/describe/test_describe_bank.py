@@ -14,18 +14,15 @@ import yaml
 from job_process import JobProcess
 from processes import run_ranks
 from safetensors.torch import load_file
-from tiny import photo, prepare, run_settings
+from street import model, street
+from tiny import prepare, run_settings
 from torch import Tensor, nn
 
 from pipeline.api import Model
 from pipeline.common.errors import DataError, UsageError
 from pipeline.config import (
-    AdapterConfig,
-    BackboneConfig,
     CrossImageConfig,
     EvaluationConfig,
-    ModelConfig,
-    PoolingConfig,
 )
 from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.describe.bank import chosen_bank, drawn
@@ -45,26 +42,9 @@ from pipeline.model.weights.files import load_model
 from pipeline.training.engines.fsdp2 import ShardedEngine
 
 
-def model() -> PlaceModel:
-    torch.manual_seed(3)
-    config = ModelConfig(
-        backbone=BackboneConfig(name="custom", dim=16, depth=1, heads=2, patch=7, pretrain_grid=4),
-        adapter=AdapterConfig(reduced=2),
-        pooling=PoolingConfig(levels=(1, 2)),
-        cross_image=CrossImageConfig(layers=2, heads=2, feedforward=16, dropout=0.0),
-    )
-    built = build_model(config, 28)
-    for parameter in built.cross_image.parameters():  # every one of them matters
-        torch.nn.init.normal_(parameter, std=0.3)
-    return built
-
-
 @pytest.fixture
 def photos(tmp_path: Path) -> EvaluationSet:
-    paths = [tmp_path / f"{i:02d}.jpg" for i in range(23)]
-    for i, path in enumerate(paths):
-        photo(i, 0).save(path)
-    return EvaluationSet("street", paths, paths[:1], [np.zeros(1, np.int64)], "pairs")
+    return street(tmp_path)
 
 
 def test_torchs_encoder_under_a_mask() -> None:
