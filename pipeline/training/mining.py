@@ -120,13 +120,13 @@ class Mining:
 
     def adopt(self, state: RunState) -> None:
         """Copies the file that a branched run needs into its own folder. Collective."""
-        if self.origin == self.folder or not state.mined or self.data.mine_from not in MODEL:
+        if self.origin.resolve() == self.folder.resolve() or not state.mined or self.data.mine_from not in MODEL:
             return
 
         def copy() -> None:
-            name = str(state.mined["file"])
-            found = read_descriptors(self._path(name), self.index.digest, self.index.places, str(state.mined["sha256"]))
-            found.save(self.folder / name)
+            source = self._path(state.mined["file"])
+            found = read_descriptors(source, self.index.digest, self.index.places, str(state.mined["sha256"]))
+            found.save(self.folder / source.name)
 
         on_rank_0(copy, what=f"copying mined descriptors to {self.folder}")
 
@@ -148,8 +148,9 @@ class Mining:
             )  # fmt: skip
 
     def _path(self, name: object) -> Path:
-        own = self.folder / str(name)
-        return own if own.exists() else self.origin / str(name)
+        plain = Path(str(name)).name  # a state.json can come from elsewhere
+        own = self.folder / plain
+        return own if own.exists() else self.origin / plain
 
 
 def rule(data: DataConfig) -> CliqueRule:
