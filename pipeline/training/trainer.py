@@ -107,6 +107,7 @@ class Trainer:
         self.main = rank() == 0
         self.run = Path(config.output) / config.name
         self.tracker = Tracker(config, enabled=False)
+        self.log: RunLog | None = None  # rank 0 writes it
         self.samples: FileIO | None = None
         self.stops: list[int] = []  # signals received
         self.problem: Exception | None = None  # met between two exchanges of the ranks, told in the next
