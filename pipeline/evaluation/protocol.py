@@ -99,11 +99,12 @@ class Protocol:
 
     def describe(self) -> str:
         """One line for people."""
+        known = f" ({self.bank_digest})" if self.bank_digest else ""
         groups = {
             "single": "each image alone",
             "shuffled": f"random groups of {self.group_size} (seed {self.group_seed})",
             "ordered": f"groups of {self.group_size} neighbours in file order",
-            "bank": f"each image beside a bank of {self.group_size} images from {self.bank_from} ({self.bank_digest})",
+            "bank": f"each image beside a bank of {self.group_size} images from {self.bank_from}{known}",
         }[self.groups]
         interpolation = "antialiased" if self.resize == "antialias" else "resized after normalising, no antialias"
         pca = "no PCA"
