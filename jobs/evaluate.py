@@ -74,7 +74,8 @@ def main() -> None:
 def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None:
     """The evaluation on this process; rank 0 writes."""
     from pipeline.distributed import on_rank_0
-    from pipeline.evaluation.evaluate import evaluate, fit_projections, model_fingerprint
+    from pipeline.evaluation.evaluate import evaluate, fit_projections
+    from pipeline.evaluation.identity import model_digest
     from pipeline.evaluation.predictions import save_results
     from pipeline.evaluation.report import tables
     from pipeline.evaluation.report.figures import also_as
@@ -94,7 +95,7 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     for line in left_out if first else ():
         print(f"left out: {line}", file=sys.stderr)
     model = load_any(file, device)
-    fingerprint = model_fingerprint(model)
+    fingerprint = model_digest(model)
     projections = None
     if config.pca and config.pca_from:
         source = load_set(config.pca_from, dataclasses.replace(config, split="train"))

@@ -99,7 +99,7 @@ def run(job: LocateJob) -> None:
     import torch
 
     from pipeline.config import EvaluationConfig
-    from pipeline.evaluation.evaluate import model_fingerprint
+    from pipeline.evaluation.identity import model_digest
     from pipeline.locate.answers import locate
     from pipeline.locate.photo_index import make_index, open_index
     from pipeline.model.weights.files import checkpoint_file
@@ -115,7 +115,7 @@ def run(job: LocateJob) -> None:
     elif photos and folder.is_dir():
         check_writable(folder, "--output")
     model = load_any(file, device)
-    fingerprint = model_fingerprint(model)
+    fingerprint = model_digest(model)
     if job.build:
         batch = job.batch or (1 if torch.device(device).type == "cpu" else 32)
         groups = job.groups if job.groups != "auto" else "single" if model.bank is None else "bank"

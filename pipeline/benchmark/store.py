@@ -23,8 +23,9 @@ from pipeline.benchmark.own_process import alone
 from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.describe.encode import BLOCK_BYTES
-from pipeline.evaluation.describe.store import DescriptorStore, StoreKey, StoreWriter
+from pipeline.evaluation.describe.store import DescriptorStore, StoreWriter, store_folder
 from pipeline.evaluation.describe.stored import evaluate_stores
+from pipeline.evaluation.identity import Identity
 from pipeline.evaluation.protocol import Protocol, Side, protocols
 from pipeline.evaluation.search.exact import batches, search
 from pipeline.evaluation.search.projection import fit_rows, projected, sample_rows
@@ -83,9 +84,12 @@ def write(output: Path, rows: int, queries: int, dim: int, stored: str) -> float
     """Seconds to make and write both sides."""
     start = time.perf_counter()
     for side, count in (("database", rows), ("queries", queries)):
-        key = StoreKey(NAME, side, "made", "made", protocol(stored))  # type: ignore[arg-type]
+        under = protocol(stored)
         blocks = list(parts(count, dim))
-        writer = StoreWriter(output, key, Numbered(side, count), None, len(blocks))  # type: ignore[arg-type]
+        writer = StoreWriter(
+            store_folder(output, NAME, under, side), Identity(side, "made", "made", under),
+            Numbered(side, count), None, len(blocks),  # type: ignore[arg-type]
+        )  # fmt: skip
         for number, block in enumerate(blocks):
             of_database = block if side == "database" else block * APART
             writer.put(number, block, made(of_database, dim, int(side == "queries")))

@@ -25,6 +25,7 @@ from pipeline.distributed import held_on_rank_0, on_rank_0, same
 from pipeline.evaluation.describe.bank import chosen_bank
 from pipeline.evaluation.describe.encode import evaluating
 from pipeline.evaluation.describe.sides import Engine
+from pipeline.evaluation.identity import Identity, files_digest, model_digest
 from pipeline.evaluation.protocol import Protocol, Side, protocols
 from pipeline.evaluation.recall import recall_at
 from pipeline.evaluation.search.approximate import agreement, build_index, index_bytes, search_index
@@ -75,15 +76,15 @@ def evaluate(
         progress: show bars on rank 0.
         projections: protocol name without PCA -> PCA fitted before (`projection.fit_projections`); needed where
             `config.pca_from` names a set; otherwise PCA is fitted on each set's own database.
-        fingerprint: identifies the weights in the store; None computes it from them when a store is wanted.
+        fingerprint: `identity.model_digest` of the model; None computes it where `output` needs it.
 
     Raises:
         DataError: images that cannot be read, descriptors that are not finite; the same on all ranks.
     """
     model = getattr(model, "module", model)
     device = torch.device(device)
-    if config.store != "none" and output is not None and fingerprint is None:
-        fingerprint = model_fingerprint(model)
+    if output is not None and fingerprint is None:
+        fingerprint = model_digest(model)
     results: list[Result] = []
     with _alone_in(output), evaluating(model), tempfile.TemporaryDirectory() as temporary:
         engine = Engine(model, config, device, output, Path(temporary), progress, fingerprint or "")
@@ -118,15 +119,6 @@ def _names_digest(evaluated: EvaluationSet) -> str:
     return hashlib.sha256(names.encode(errors="surrogateescape")).hexdigest()[:16]
 
 
-def model_fingerprint(model: nn.Module) -> str:
-    """Sixteen hex digits of the weights and buffers themselves, whatever file they came from."""
-    seen = hashlib.sha256()
-    for name, tensor in sorted(model.state_dict().items()):
-        seen.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        seen.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
-    return seen.hexdigest()[:16]
-
-
 def fit_projections(
     model: nn.Module,
     source: EvaluationSet,
@@ -139,7 +131,8 @@ def fit_projections(
     """PCA of `source`'s database for every grouping: name of the grouping -> projection. Collective.
 
     At most `projection.SAMPLE` images, seeded; groups are formed over the sample. Kept in the folder `beside`, under
-    a name with the weights' `fingerprint`, and read from there the next time. Ranks other than 0 get {}.
+    the digest of its identity (`fingerprint` is the model's digest), and read from there the next time. Ranks other
+    than 0 get {}.
     """
     model, device = getattr(model, "module", model), torch.device(device)
     rows = sample_rows(len(source.database))
@@ -158,13 +151,16 @@ def fit_projections(
         bank = chosen_bank(model, config, source.database, device)
     chosen = protocols(config, model.image_size, source.rule, bank)  # type: ignore[arg-type]
 
-    def file(protocol: Protocol) -> Path | None:
-        name = f"pca-{config.pca}{'w' if protocol.whiten else ''}.{source.name}.{protocol.grouping.name}"
-        name += protocol.bank_digest and f".{protocol.bank_digest}"
-        return None if beside is None else beside / f"{name}.{fingerprint}.safetensors"
+    files: dict[Protocol, Path] = {}
 
     def read() -> list[Protocol]:
-        kept = {p: path for p in chosen if (path := file(p)) is not None and path.is_file()}
+        if beside is not None:
+            digest = files_digest(sampled.database)
+            for p in chosen:
+                fit = dataclasses.replace(p.grouping, pca=p.pca, whiten=p.whiten)
+                name = f"pca.{source.name}.{fit.name}.{Identity('pca', fingerprint, digest, fit).digest}.safetensors"
+                files[p] = beside / name
+        kept = {p: path for p, path in files.items() if path.is_file()}
         fitted.update({p.grouping.name: load_projection(path) for p, path in kept.items()})
         return [p for p in chosen if p not in kept]
 
@@ -172,8 +168,8 @@ def fit_projections(
         about = f"{source.name} database, {len(rows)} of {len(source.database)} images, {protocol.grouping.name}"
         projection = fit_rows(_there(blocks), np.arange(len(rows)), config.pca or 0, protocol.whiten, about, device)
         fitted[protocol.grouping.name] = projection
-        if (path := file(protocol)) is not None:
-            projection.save(path)
+        if protocol in files:
+            projection.save(files[protocol])
 
     missing = on_rank_0(read)
     if not missing:

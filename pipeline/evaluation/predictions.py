@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from pipeline.common.errors import DataError
 from pipeline.common.text import shown
 from pipeline.evaluation.evaluate import Result
-from pipeline.evaluation.protocol import Protocol
+from pipeline.evaluation.protocol import Protocol, read_protocol
 from pipeline.evaluation.recall import first_hits
 from pipeline.evaluation.report import tables
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
@@ -93,7 +93,7 @@ def load_predictions(path: Path) -> Predictions:
         about = json.loads(table.schema.metadata[META])
         return Predictions(
             about["set"],
-            Protocol(**about["protocol"]),
+            read_protocol(about["protocol"], str(path)),
             table["query"].to_pylist(),
             np.array(table["rows"].to_pylist(), np.int64),
             np.array(table["distances"].to_pylist(), np.float32),

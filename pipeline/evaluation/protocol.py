@@ -8,94 +8,91 @@ an evaluation set holds what is left over and may be short, as in the published 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
 
+from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
 from pipeline.model.bank import Bank
 
 Side = Literal["database", "queries"]
+WORD = 40  # characters of a value in a protocol's name
+
+
+Stage = Literal["descriptors", "answers"]
+
+
+def named(short: str, stage: Stage, default: Any = dataclasses.MISSING) -> Any:
+    """A field of a protocol.
+
+    Args:
+        short: how a value other than the default stands in the protocol's name; `{}` is the value.
+        stage: whether descriptors depend on it, or only what is answered from them.
+        default: not told in the name; a field without one always is.
+    """
+    return dataclasses.field(default=default, metadata={"short": short, "stage": stage})
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """How descriptors were computed and compared (paper, section 4.1, and the batch that its code implies)."""
+    """How descriptors were computed and compared (paper, section 4.1, and the batch that its code implies).
 
-    groups: str
+    Invariant: protocols that differ have different names, because the name is made of all fields that differ from
+    their defaults.
+    """
+
+    groups: str = named("{}", "descriptors")
     """single: each image alone; shuffled: seeded random groups; ordered: neighbours in file order (as published);
     bank: each image beside a fixed bank of images."""
-    group_size: int
+    group_size: int = named("{}", "descriptors", 1)
     """Images that share one pass of the cross-image encoder; 1 for single; for bank the images of the bank."""
-    group_seed: int
+    group_seed: int = named("s{}", "descriptors", 0)
     """Seed of the shuffled groups; 0 and without effect otherwise."""
-    image_size: int
-    """Side of the square input, pixels."""
-    resize: str
-    """antialias, or published: normalised first, then bilinear without antialias."""
-    pca: int | None
+    pca: int | None = named("_pca{}", "answers", None)
     """Dimensions kept by PCA; None keeps all."""
-    rule: str
-    """What counts as a positive, for example "25 m"."""
-    without_positives: str
-    """miss or drop: what happens to queries that have no positive."""
-    whiten: bool = False
+    whiten: bool = named("w", "answers", False)
     """Whether PCA also scales each direction to unit variance."""
-    pca_source: str | None = None
+    pca_source: str | None = named("_from-{}", "answers", None)
     """Whose database descriptors PCA was fitted on; None: the evaluated set's own."""
-    precision: str = "fp32"
+    resize: str = named("_{}", "descriptors", "antialias")
+    """antialias, or published: normalised first, then bilinear without antialias."""
+    image_size: int = named("_{}px", "descriptors", 224)
+    """Side of the square input, pixels."""
+    rule: str = named("_{}", "answers", "25 m")
+    """What counts as a positive, for example "25 m"."""
+    without_positives: str = named("_{}", "answers", "miss")
+    """miss or drop: what happens to queries that have no positive."""
+    precision: str = named("_{}", "descriptors", "fp32")
     """Arithmetic of the per-image part: fp32, bf16 or fp16 autocast."""
-    stored: str = "fp32"
+    stored: str = named("_{}store", "descriptors", "fp32")
     """Type in which descriptors were kept before the search: fp32 or fp16."""
-    search: str = "exact"
+    search: str = named("_{}", "answers", "exact")
     """exact L2, or the approximate index used."""
-    rerank: int = 0
+    rerank: int = named("_rerank{}", "answers", 0)
     """Candidates put in order anew by matching patches in space (a second stage); 0: none, one stage."""
-    rerank_layer: int | None = None
+    rerank_layer: int | None = named("l{}", "answers", None)
     """Block or stage of the backbone whose patches were matched; None: its last."""
 
-    bank_from: str = ""
+    bank_from: str = named("{}", "descriptors", "train")
     """bank: train, map, or the folder's name."""
-    bank_digest: str = ""
-    """bank: sixteen hex digits of its regions; empty before it is known."""
+    bank_digest: str = named("", "descriptors", "")
+    """bank: sixteen hex digits of its regions; empty before it is known. It is in the identity, not in the name."""
 
     @property
     def name(self) -> str:
-        """Short and safe in metric names, for example "shuffled16" or "ordered8_pca4096"."""
-        parts = [self.groups if self.groups == "single" else f"{self.groups}{self.group_size}"]
-        if self.groups == "shuffled" and self.group_seed:
-            parts[0] += f"s{self.group_seed}"
-        if self.groups == "bank" and self.bank_from != "train":
-            parts[0] += re.sub(r"[^A-Za-z0-9-]", "-", self.bank_from)  # "bank64map"
-        if self.pca:
-            parts.append(f"pca{self.pca}{'w' if self.whiten else ''}")
-        if self.resize != "antialias":
-            parts.append(self.resize)
-        if self.without_positives == "drop":
-            parts.append("drop")
-        parts += [value for value in (self.precision, self.search) if value not in ("fp32", "exact")]
-        if self.rerank:
-            parts.append(f"rerank{self.rerank}" + (f"l{self.rerank_layer}" if self.rerank_layer else ""))
-        if self.stored != "fp32":
-            parts.append(f"{self.stored}store")
-        return "_".join(parts)
+        """Short, and safe in metric names and file names: "shuffled16", "ordered8_pca4096", "single_322px_10m"."""
+        told = ((field.metadata["short"], getattr(self, field.name), field.default) for field in fields(self))
+        return "".join(short.format(_word(value)) for short, value, default in told if value != default)
 
     @property
     def grouping(self) -> Protocol:
         """The same protocol without what happens after the descriptors: PCA, positives, search."""
-        return dataclasses.replace(
-            self,
-            pca=None,
-            whiten=False,
-            pca_source=None,
-            rule="",
-            without_positives="",
-            search="exact",
-            rerank=0,
-            rerank_layer=None,
-        )
+        later: dict[str, Any] = {f.name: f.default for f in fields(self) if f.metadata["stage"] == "answers"}
+        return dataclasses.replace(self, **later)
 
     def describe(self) -> str:
         """One line for people."""
@@ -142,6 +139,14 @@ class Protocol:
         return [order[first : first + size] for first in range(0, images, size)]
 
 
+def read_protocol(values: Any, where: str) -> Protocol:
+    """The protocol of a file. Raises `DataError` where it is none of this version."""
+    try:
+        return Protocol(**values)
+    except TypeError:
+        raise DataError(f"{where}: not a protocol of this version; evaluate again") from None
+
+
 def protocols(config: EvaluationConfig, image_size: int, rule: str, bank: Bank | None = None) -> list[Protocol]:
     """The protocols that the configuration asks for, in its order; `bank`: the one that `groups` bank is beside."""
     sizes = {"single": 1, "bank": config.bank if bank is None else len(bank.regions)}
@@ -162,11 +167,21 @@ def protocols(config: EvaluationConfig, image_size: int, rule: str, bank: Bank |
             search=config.search,
             rerank=config.rerank,
             rerank_layer=config.rerank_layer if config.rerank else None,
-            bank_from="" if groups != "bank" else config.bank_from if bank is None else bank.source,
+            bank_from="train" if groups != "bank" else config.bank_from if bank is None else bank.source,
             bank_digest=bank.digest if groups == "bank" and bank is not None else "",
         )
         for groups in dict.fromkeys(config.groups)
     ]
+
+
+def _word(value: Any) -> str:
+    """A value as letters, digits, points and hyphens; what that loses stands in six digits of its hash."""
+    text = str(value)
+    plain = re.sub(
+        r"[^A-Za-z0-9.]+", "-", text.replace(" m", "m").replace("+-", "").replace(" frames", "frames")
+    ).strip("-.")[:WORD]
+    lossless = plain == text or re.fullmatch(r"[0-9.e]+ m|\+-[0-9]+ frames|listed positives", text)
+    return plain if lossless else f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:6]}"
 
 
 def metric_name(set_name: str, protocol: Protocol, k: int) -> str:

@@ -33,13 +33,14 @@ from pipeline.common.files import locked, sync_path, write_atomically
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.describe.bank import chosen_bank
 from pipeline.evaluation.describe.encode import describe_each, evaluating
-from pipeline.evaluation.protocol import Protocol, protocols
+from pipeline.evaluation.identity import Identity
+from pipeline.evaluation.protocol import Protocol, protocols, read_protocol
 from pipeline.evaluation.search.approximate import build_index, load_index, save_index
 from pipeline.evaluation.search.projection import Projection, fit_rows, load_projection, projected, sample_rows
 from pipeline.locate.descriptor_cache import KeptDescriptors
 from pipeline.locate.photos import Photos, find_photos
 
-FORMAT = "place-index 2"
+FORMAT = "place-index 3"  # 3: the fingerprint is also of the model's config
 ABOUT, INDEX, PHOTOS, PCA = "about.json", "index.faiss", "photos.parquet", "pca.safetensors"
 DESCRIBED, LOCK = "described", ".lock"
 LARGEST = 65_536  # images of a bank: all that it has
@@ -108,7 +109,7 @@ def make_index(
         config: its `resize`, `precision`, `search`, `pca` and `pca_whiten` make the index, and the first of its
             `groups`: `bank` (the model's own) or `single`; `batch` and `workers` its speed. A `batch` above 1 may
             change the rounding of descriptors.
-        fingerprint: identifies the weights (`evaluate.model_fingerprint`).
+        fingerprint: identifies the model (`identity.model_digest`).
         about: more to be kept in `about.json`, such as the checkpoint's path.
 
     Raises:
@@ -125,9 +126,9 @@ def make_index(
     photos = find_photos(sources, progress)
     with _building(folder):
         former = _former(folder)
-        settings = {"fingerprint": fingerprint, "image_size": protocol.image_size, "resize": protocol.resize}
-        beside = {"bank": protocol.bank_digest} if bank is not None else {}
-        kept = KeptDescriptors(folder / DESCRIBED, {**settings, "precision": protocol.precision, **beside})
+        # of each photo by itself: `kept` compares the files one by one
+        each_alone = Identity("photo", fingerprint, "", protocol.grouping)
+        kept = KeptDescriptors(folder / DESCRIBED, {"identity": each_alone.digest})
         found = kept.find(photos.files, photos.states)
         missing = [at for at in range(len(photos.files)) if at not in found]
         growth = _growth(former, photos, len(missing))
@@ -211,7 +212,7 @@ def _open(folder: Path, fingerprint: str) -> PhotoIndex:
             )
         place = _place(folder, about)
         table = pq.read_table(place / PHOTOS)
-        root, protocol = Path(about["root"]), Protocol(**about["protocol"])
+        root, protocol = Path(about["root"]), read_protocol(about["protocol"], str(folder))
         photos = [root / name for name in table["photo"].to_pylist()]
         pairs = [
             np.stack([table[name].to_numpy() for name in names], axis=1)
@@ -274,13 +275,13 @@ def _growth(
 
 
 def _contents(photos: Photos, protocol: Protocol, fingerprint: str) -> str:
-    """Sixteen hex digits of all that the index is made of."""
-    settings = [FORMAT, fingerprint, protocol.to_dict(), photos.zone, photos.coordinates]
-    seen = hashlib.sha256(json.dumps(settings).encode())
-    seen.update("\n".join(map(str, photos.files)).encode())
-    for array in (photos.states, photos.positions, photos.degrees):
+    """Digest of the identity of all that the index is made of."""
+    seen = hashlib.sha256(json.dumps([FORMAT, photos.zone, photos.coordinates]).encode())
+    for array in (photos.positions, photos.degrees):
         seen.update(b"|" if array is None else np.ascontiguousarray(array).tobytes())
-    return seen.hexdigest()[:16]
+    files = hashlib.sha256("\n".join(map(str, photos.files)).encode("utf-8", "surrogateescape"))
+    files.update(np.ascontiguousarray(photos.states).tobytes())
+    return Identity("photos", fingerprint, files.hexdigest()[:16], protocol, seen.hexdigest()[:16]).digest
 
 
 def _write_photos(photos: Photos, file: Path) -> None:

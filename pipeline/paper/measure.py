@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import EvaluationConfig, from_dict, to_dict
-from pipeline.evaluation.evaluate import Result, evaluate, fit_projections, model_fingerprint
+from pipeline.evaluation.evaluate import Result, evaluate, fit_projections
+from pipeline.evaluation.identity import model_digest
 from pipeline.evaluation.predictions import save_predictions
 from pipeline.evaluation.report import tables
 from pipeline.evaluation.sets.load import load_set
@@ -56,7 +57,7 @@ def measure(order: Path, accelerator: Any) -> None:
     run = Path(told["run"])
     file, output = checkpoint_file(run), folder(run)
     model = load_model(file, accelerator.device)
-    fingerprint = model_fingerprint(model)
+    fingerprint = model_digest(model)
     configs = {key: from_dict(EvaluationConfig, values) for key, values in told["evaluations"].items()}
     for key, config in configs.items():
         projections = None

@@ -6,32 +6,33 @@ evaluation counts only when all its recalls are there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.evaluation.protocol import metric_name
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.paper.plan import Cell, Training
 from pipeline.paper.runner import Recalls
 from pipeline.training.tracking import open_client, store_uri
 
 
-def recorded(training: Training, cells: Sequence[Cell], names: dict[str, str]) -> dict[str, Recalls]:
+def recorded(training: Training, cells: Sequence[Cell], sets: Mapping[str, EvaluationSet]) -> dict[str, Recalls]:
     """Recalls of a finished training, by `Cell.key`: a table can be printed where the run folders are not.
 
     Args:
-        names: `Cell.set_name` -> the set's short name in metrics.
+        sets: `Cell.set_name` -> the set, whose name and rule stand in metrics.
     """
     metrics = _metrics(training)
     found: dict[str, Recalls] = {}
     for cell in cells:
         recalls: Recalls = {}
-        for protocol in cell.protocols(""):
-            name = names[cell.set_name]
+        name, chosen = sets[cell.set_name].name, cell.protocols(sets[cell.set_name].rule)
+        for protocol in chosen:
             values = {k: metrics.get("evaluation/" + metric_name(name, protocol, k)) for k in cell.config.recalls}
             if all(value is not None for value in values.values()):
                 recalls[name, protocol.name] = {k: float(v) for k, v in values.items() if v is not None}
-        if recalls and len(recalls) == len(cell.protocols("")):
+        if recalls and len(recalls) == len(chosen):
             found[cell.key] = recalls
     return found
 

@@ -64,8 +64,7 @@ class Study:
             known = {cell.key: found for cell in cells if (found := self.runner.results(cell)) is not None}
             lacking = [cell for cell in cells if cell.key not in known]
             if lacking:
-                names = {cell.set_name: self.sets[cell.set_name].name for cell in lacking}
-                known |= recorded(each, lacking, names)
+                known |= recorded(each, lacking, self.sets)
                 lacking = [cell for cell in lacking if cell.key not in known]
             if lacking and run:
                 try:

@@ -106,7 +106,7 @@ def test_a_table_is_filled_continued_and_found_in_mlflow(root: Path) -> None:
     )
     (truth,) = evaluate(load_model(run_folder), [load_set(str(root / "evaluation"), asked)], asked, "cpu")
     assert 0 < truth.recalls[1] < 100
-    assert {k: ours["4", "ordered4_published", str(k)] for k in (1, 5)} == truth.recalls
+    assert {k: ours["4", "ordered4_published_28px", str(k)] for k in (1, 5)} == truth.recalls
     # the paper's figure for the same row, named with its set
     assert {r["paper"] for r in rows if r["row"] == "4" and r["n"] == "1"} == {"93.9"}
     assert {r["paper_set"] for r in rows} == {"pitts30k"}

@@ -17,7 +17,7 @@ from jobs.locate import path_words
 from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
 from pipeline.data.images import load_image, normalise, to_input
-from pipeline.evaluation.evaluate import model_fingerprint
+from pipeline.evaluation.identity import model_digest
 from pipeline.locate.answers import locate
 from pipeline.locate.photo_index import make_index, open_index
 from pipeline.model.vpr import PlaceModel
@@ -107,7 +107,7 @@ def test_saved_and_opened_with_positions_from_a_manifest(home: Path, model: Plac
 
 
 def test_mistakes_are_one_line(home: Path, model: PlaceModel, tmp_path: Path) -> None:
-    make_index(model, home / "plain", home / "index", CONFIG, "cpu", model_fingerprint(model), progress=False)
+    make_index(model, home / "plain", home / "index", CONFIG, "cpu", model_digest(model), progress=False)
     asked = str(home / "asked" / "seven.png")
     broken = tmp_path / "broken.jpg"
     broken.write_bytes((home / "plain" / "p01.jpg").read_bytes()[:300])

@@ -64,12 +64,12 @@ def test_dimensions_and_radius_from_the_store_alone(home: Path, radius: float) -
     options = ["--dimensions", "8,2,1", "--recalls", "1,3", "--radius", str(radius), "--output", str(out)]
     stores = ["--from_store", str(home / "run" / "evaluation"), "--root", str(home / "data")]
     text = finished("jobs.evaluate", home / "log", *stores, *options)
-    assert "single_pca2" in text and "ordered4_pca8" in text
+    assert "single_pca2_28px" in text and "ordered4_pca8_28px" in text
     results = json.loads((out / "results.json").read_text())["results"]
     assert len(results) == 8
     for result in results:
         protocol = result["protocol"]
-        grouping = "single" if protocol["groups"] == "single" else "ordered4"
+        grouping = "single_28px" if protocol["groups"] == "single" else "ordered4_28px"
         assert result["recalls"] == pytest.approx(plainly(home, grouping, protocol["pca"], radius)), result
         assert protocol["rule"] == f"{radius:g} m"
         assert (out / "predictions" / f"town.{result['protocol_name']}.parquet").is_file()

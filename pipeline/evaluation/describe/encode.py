@@ -148,7 +148,8 @@ def encode(
         wanted: for each grouping, the blocks that will be correlated; a rank keeps what its groups in them need.
         scratch: folder for the regions of sets too large for memory; None: memory alone.
         fixed: fill the last forward batch up, so that all have `config.batch` images and none rounds otherwise.
-        key: what the regions depend on; a file in `scratch` left by a killed run with the same key is continued.
+        key: digest of what the regions depend on (`Identity`); a file in `scratch` left by a killed run with the same
+            key and batch is continued: its progress is counted in batches.
 
         beyond: photos that will be described next; where one of `paths` is broken, these are looked through too.
 
@@ -160,7 +161,7 @@ def encode(
     positions = np.unique(np.concatenate(mine)) if mine else np.empty(0, np.int64)
     shape = (len(positions), *region_shape(model))
     dtype = _dtype(model)
-    own_key = f"{key} {r}/{w} {zlib.crc32(positions.tobytes())}"
+    own_key = f"{key} batches of {config.batch}, {r}/{w} {zlib.crc32(positions.tobytes())}"
     values, resume = distributed.agreed(partial(_allocate, shape, dtype, scratch, own_key), what=label)
     regions = Regions(positions, values)
 

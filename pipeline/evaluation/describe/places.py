@@ -27,7 +27,7 @@ from pipeline.data.places import VIEWS, PlaceLoader
 from pipeline.data.plan import EpochPlan
 from pipeline.data.shard_sets import cities_of, rows_of_round
 from pipeline.evaluation.describe.encode import evaluating
-from pipeline.evaluation.evaluate import model_fingerprint
+from pipeline.evaluation.identity import model_digest
 from pipeline.evaluation.search.exact import slices
 from pipeline.evaluation.search.projection import fit_rows, sample_rows
 from pipeline.model.vpr import PlaceModel
@@ -120,7 +120,7 @@ def describe_places(
             values /= np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-30)
             if kind == "permuted":
                 values = values[permuted(index)]
-            return PlaceDescriptors(values.astype(np.float16), index.digest, kind, model_fingerprint(model), turn)
+            return PlaceDescriptors(values.astype(np.float16), index.digest, kind, model_digest(model), turn)
 
         return distributed.agreed(shortened, what="mining")
 

@@ -22,7 +22,8 @@ from pipeline import distributed
 from pipeline.common.files import reserve
 from pipeline.config import EvaluationConfig, to_dict
 from pipeline.evaluation.describe.encode import Block, Regions, blocks_of, calls_of, correlate, encode
-from pipeline.evaluation.describe.store import DescriptorStore, StoreKey, StoreWriter, files_digest
+from pipeline.evaluation.describe.store import DescriptorStore, StoreWriter, store_folder
+from pipeline.evaluation.identity import Identity, files_digest
 from pipeline.evaluation.protocol import Protocol, Side
 from pipeline.evaluation.search.exact import Blocks, slices
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
@@ -45,6 +46,7 @@ class Engine:
     temporary: Path
     progress: bool
     fingerprint: str
+    """`model_digest`; needed with an output folder."""
 
     def side(
         self, evaluated: EvaluationSet, side: Side, chosen: Sequence[Protocol], bank: Bank | None = None
@@ -62,12 +64,13 @@ class Engine:
 
         def open_stores() -> tuple[str, dict[Protocol, frozenset[int]]]:
             digest = files_digest(paths)
-            writers.update({p: self._writer(evaluated, side, p, digest, len(blocks[p])) for p in chosen})
+            if self.config.store != "none":
+                writers.update({p: self._writer(evaluated, side, p, digest, len(blocks[p])) for p in chosen})
             return digest, {p: writer.done for p, writer in writers.items()}
 
         done: dict[Protocol, frozenset[int]] = {}
-        if self.config.store != "none" and self.output is not None:
-            files, done = distributed.on_rank_0(open_stores, what=f"the descriptor store in {self.output}")
+        if self.output is not None:
+            files, done = distributed.on_rank_0(open_stores, what=f"the descriptors in {self.output}")
         missing = [p for p in chosen if len(done.get(p, ())) < len(blocks[p])]
         scratch = (self.output or self.temporary) / "scratch" / f"{evaluated.name}.{side}"
         regions = None
@@ -80,7 +83,7 @@ class Engine:
                 self.device,
                 f"{evaluated.name} {side}: encoding",
                 scratch,
-                f"{self.fingerprint} {files} {[p.grouping.name for p in missing]}" if self.fingerprint else "",
+                " ".join(Identity("regions", self.fingerprint, files, p.grouping).digest for p in missing),
                 self.progress,
                 evaluated.queries if side == "database" else (),
                 any(p.groups == "bank" for p in missing),
@@ -96,8 +99,8 @@ class Engine:
         model_config = getattr(self.model, "config", None)
         described = dataclasses.is_dataclass(model_config) and not isinstance(model_config, type)
         return StoreWriter(
-            self.output,
-            StoreKey(evaluated.name, side, self.fingerprint, files, protocol.grouping),
+            store_folder(self.output, evaluated.name, protocol, side),
+            Identity(side, self.fingerprint, files, protocol.grouping),
             evaluated.database if of_database else evaluated.queries,
             evaluated.database_positions if of_database else evaluated.query_positions,
             parts,

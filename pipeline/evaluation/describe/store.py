@@ -1,8 +1,8 @@
 """Descriptors on disk: a folder of Parquet parts that any Parquet reader opens, each with its protocol inside.
 
-Invariant: a part exists whole or not at all, and belongs to exactly one key: weights, files, protocol, side. Only one
-part is in memory at a time, writing and reading. A killed extraction continues behind its last part; when nothing has
-changed there is nothing to do; when anything has, the stale parts are removed first.
+Invariant: a part exists whole or not at all, and belongs to exactly one `Identity`: weights, config, files, grouping,
+side. Only one part is in memory at a time, writing and reading. A killed extraction continues behind its last part;
+when nothing has changed there is nothing to do; when anything has, the stale parts are removed first.
 
 Columns: `row` (position in the set), `key` (the image's path), `utm_east`, `utm_north` (metres or null), `descriptor`
 (fixed_size_list of float or halffloat). Rows stand in the order of their groups, so shuffled parts are not sorted.
@@ -10,10 +10,8 @@ Columns: `row` (position in the set), `key` (the image's path), `utm_east`, `utm
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,71 +20,41 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.common.errors import DataError
-from pipeline.evaluation.protocol import Protocol, Side
+from pipeline.evaluation.identity import Identity
+from pipeline.evaluation.protocol import Protocol, read_protocol
 
 META = b"place_recognition"
 KEYS = 4_096  # paths compared at a time
 READ_BYTES = 2**24  # of descriptors read at a time: decoding needs a multiple of it
 
 
-@dataclass(frozen=True)
-class StoreKey:
-    """What descriptors depend on. Equal keys, equal descriptors."""
-
-    set_name: str
-    side: Side
-    model: str
-    """Digest of the weights."""
-    files: str
-    """Digest of the images' names, sizes and times (`files_digest`)."""
-    protocol: Protocol
-    """Its `grouping`: without what happens after the descriptors."""
-
-    @property
-    def digest(self) -> str:
-        """Sixteen hex digits of all of it."""
-        plain = {**self.__dict__, "protocol": self.protocol.to_dict()}
-        return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
-
-    def folder(self, output: Path) -> Path:
-        """`<output>/descriptors/<set>/<protocol>/<side>`"""
-        return output / "descriptors" / self.set_name / self.protocol.name / self.side
-
-
-def files_digest(paths: Sequence[Path]) -> str:
-    """Sixteen hex digits that change when a file is added, removed, renamed, resized or rewritten."""
-    seen = hashlib.sha256()
-    for path in paths:
-        try:
-            state = path.stat()
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read ({error.strerror or error})") from None
-        seen.update(f"{path}|{state.st_size}|{state.st_mtime_ns}\n".encode())
-    return seen.hexdigest()[:16]
+def store_folder(output: Path, set_name: str, protocol: Protocol, side: str) -> Path:
+    """`<output>/descriptors/<set>/<grouping>/<side>`: where the descriptors of one side of a set are kept."""
+    return output / "descriptors" / set_name / protocol.grouping.name / side
 
 
 class StoreWriter:
-    """Writes the parts of one key; made on rank 0 alone."""
+    """Writes the parts of one identity; made on rank 0 alone."""
 
     def __init__(
         self,
-        output: Path,
-        key: StoreKey,
+        folder: Path,
+        identity: Identity,
         paths: Sequence[Path],
         positions: np.ndarray | None,
         parts: int,
         model_config: dict[str, Any] | None = None,
     ) -> None:
-        """`positions` [n, 2] UTM metres or None; `parts` is how many blocks there will be."""
-        self.folder, self.key, self.paths, self.positions, self.parts = key.folder(output), key, paths, positions, parts
+        """`folder`: of `store_folder`; `positions`: [n, 2] UTM metres or None; `parts`: how many blocks will come."""
+        self.folder, self.paths, self.positions, self.parts = folder, paths, positions, parts
+        self.stored = identity.protocol.stored
         self._about = {
-            "key": key.digest,
-            "set": key.set_name,
-            "side": key.side,
-            "model": key.model,
+            "key": identity.digest,
+            "side": identity.of,
+            "model": identity.model,
             "model_config": model_config,
-            "files": key.files,
-            "protocol": key.protocol.to_dict(),
+            "files": identity.files,
+            "protocol": identity.protocol.to_dict(),
             "parts": parts,
             "rows": len(paths),
         }
@@ -104,7 +72,7 @@ class StoreWriter:
 
     def put(self, number: int, positions: np.ndarray, descriptors: np.ndarray) -> None:
         """Writes part `number`: descriptors [n, dim] of the images at `positions` [n]."""
-        kind = np.float16 if self.key.protocol.stored == "fp16" else np.float32
+        kind = np.float16 if self.stored == "fp16" else np.float32
         flat = np.ascontiguousarray(descriptors, dtype=kind).reshape(-1)
         places = None if self.positions is None else np.asarray(self.positions, np.float64)[positions]
         east, north = (None, None) if places is None else (places[:, 0], places[:, 1])
@@ -154,7 +122,7 @@ class DescriptorStore:
             )
         self.rows = int(self.about["rows"])
         self.dim = int(pq.read_schema(self.files[0]).field("descriptor").type.list_size)
-        self.protocol = Protocol(**self.about["protocol"])
+        self.protocol = read_protocol(self.about["protocol"], str(folder))
 
     def __len__(self) -> int:
         return self.rows

@@ -6,6 +6,7 @@ paper's figures, where it gives any, stand in the row of the same protocol, or i
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -14,16 +15,30 @@ from typing import Any
 from pipeline.common.errors import DataError
 from pipeline.common.text import Table, csv_text, markdown_text, printable
 from pipeline.evaluation.evaluate import Result
-from pipeline.evaluation.protocol import metric_name
+from pipeline.evaluation.protocol import Protocol, metric_name
 from pipeline.evaluation.report.paper_numbers import FIGURES, HEADLINE, Reported, reported
+from pipeline.evaluation.sets.registry import SETS, published_name
 
 FORMAT_VERSION = 1
 
 
 def paper_figures(result: Result) -> Reported | None:
-    """The paper's figures for this set under this protocol (but for interpolation), where it gives them."""
-    name = result.protocol.name.replace("_published", "")
-    return FIGURES.get((result.set_name, HEADLINE, name))
+    """The paper's figures for this set, where it gives them and the protocol is the paper's in every field.
+
+    Its PCA was fitted on Pitts30k, its images were resized after normalising, positives follow the set's published
+    rule; a query without positives makes a difference only where there is one.
+    """
+    ours, rule = result.protocol, SETS[result.set_name].rule if result.set_name in SETS else None
+    theirs = ours.resize == "published" and ours.rule == rule and (not ours.pca or _is_pitts30k(ours.pca_source))
+    plain = dataclasses.replace(ours, resize="antialias", pca_source=None, rule=Protocol(groups="single").rule)
+    if not result.without_positives:
+        plain = dataclasses.replace(plain, without_positives="miss")
+    return FIGURES.get((result.set_name, HEADLINE, plain.name)) if theirs else None
+
+
+def _is_pitts30k(source: str | None) -> bool:
+    """Whether a set, by name or folder, is Pitts30k."""
+    return source is not None and published_name(Path(source).name) == "pitts30k"
 
 
 def table(results: Sequence[Result]) -> Table:

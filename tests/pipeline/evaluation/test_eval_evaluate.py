@@ -86,7 +86,7 @@ def plainly(model: Tiny, paths: list[Path], groups: list[np.ndarray]) -> np.ndar
 def test_predictions_equal_a_plain_restatement(tmp_path: Path) -> None:
     evaluated, model = make_set(tmp_path), Tiny()
     results = evaluate(model, [evaluated], CONFIG, "cpu", progress=False)
-    assert [r.protocol.name for r in results] == ["single", "shuffled4s3", "ordered4"]
+    assert [r.protocol.name for r in results] == ["single_16px_pairs", "shuffled4s3_16px_pairs", "ordered4_16px_pairs"]
     for result, protocol in zip(results, protocols(CONFIG, 16, "pairs"), strict=True):
         database = plainly(model, evaluated.database, protocol.form(37, "database"))
         queries = plainly(model, evaluated.queries, protocol.form(13, "queries"))
@@ -154,7 +154,7 @@ def test_store_is_reused_and_gives_the_same_results(tmp_path: Path) -> None:
     for a, b, c in zip(plain, first, again, strict=True):
         assert (a.predictions == b.predictions).all() and (a.predictions == c.predictions).all()
     # one lost part is computed again, and only that grouping
-    (out / "descriptors/fields/ordered4/queries/part-00000.parquet").unlink()
+    (out / "descriptors/fields/ordered4_16px/queries/part-00000.parquet").unlink()
     evaluate(model, [evaluated], config, "cpu", output=out, progress=False)
     assert model.calls[calls:] == [4, 4, 4, 1]
     # other weights under the same folder: nothing may be reused
@@ -193,7 +193,7 @@ def test_recalls_and_pca_tables_come_from_the_store_alone(tmp_path: Path) -> Non
 def test_an_approximate_search_says_how_well_it_agrees(tmp_path: Path, search: str) -> None:
     config = dataclasses.replace(CONFIG, groups=("single",), search=search)  # type: ignore[arg-type]
     result = evaluate(Tiny(), [make_set(tmp_path)], config, "cpu", progress=False)[0]
-    assert f"{search} finds " in result.remarks[0] and result.protocol.name == f"single_{search}"
+    assert f"{search} finds " in result.remarks[0] and result.protocol.name == f"single_16px_pairs_{search}"
 
 
 def run_rank(rank: int, world: int, folder: Path, evaluated: EvaluationSet, broken: bool) -> None:

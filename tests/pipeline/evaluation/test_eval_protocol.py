@@ -61,7 +61,10 @@ def test_description_names_everything_and_the_dict_rebuilds_it() -> None:
         word in line for word in ("16 neighbours", "322", "no antialias", "PCA 4096", "pitts30k", "25 m", "dropped")
     )
     assert Protocol(**protocol.to_dict()) == protocol
-    assert metric_name("pitts30k", protocol, 5) == "pitts30k.ordered16_pca4096_published_drop.recall_at_5"
+    assert (
+        metric_name("pitts30k", protocol, 5)
+        == "pitts30k.ordered16_pca4096_from-pitts30k_published_322px_drop.recall_at_5"
+    )
     assert protocol.grouping.pca is None and protocol.grouping.resize == "published"
 
 

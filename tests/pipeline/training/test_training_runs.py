@@ -222,7 +222,7 @@ def test_recorded_in_mlflow_and_continued_there(root: Path) -> None:
     assert run.data.params["data.places_per_batch"] == "4"
     history = client.get_metric_history(run.info.run_id, "train/loss")
     assert {m.step for m in history} == set(range(1, 7))
-    recalls = client.get_metric_history(run.info.run_id, "validation/evaluation.shuffled4.recall_at_5")
+    recalls = client.get_metric_history(run.info.run_id, "validation/evaluation.shuffled4_28px.recall_at_5")
     assert sorted({m.step for m in recalls}) == [0, 6]
     models = client.search_logged_models([experiment.experiment_id])
     assert any(Path(m.tags["checkpoint"]).joinpath("model.safetensors").exists() for m in models)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +74,11 @@ def test_a_killed_encoding_continues_from_its_file(tmp_path: Path, monkeypatch: 
             encode(model, paths, [blocks], CONFIG, cpu, scratch=scratch, key="k", progress=False)
         assert json.loads((scratch / "regions.0.json").read_text())["done"] == 64
         paths[280].write_bytes(content)
+        # another batch size counts other batches: what was done is not continued, and nothing is left out
+        other = dataclasses.replace(CONFIG, batch=8)
+        shutil.copytree(scratch, tmp_path / "other")
+        redone = encode(model, paths, [blocks], other, cpu, scratch=tmp_path / "other", key="k", progress=False)
+        np.testing.assert_allclose(redone.values, whole.values, rtol=1e-6)
         model.seen = 0
         again = encode(model, paths, [blocks], CONFIG, cpu, scratch=scratch, key="k", progress=False)
         assert isinstance(again.values, np.memmap) and model.seen == 300 - 64 * 4

@@ -15,19 +15,24 @@ import pytest
 from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.describe.encode import blocks_of
-from pipeline.evaluation.describe.store import DescriptorStore, StoreKey, StoreWriter, files_digest
+from pipeline.evaluation.describe.store import DescriptorStore, StoreWriter, store_folder
+from pipeline.evaluation.identity import Identity, files_digest
 from pipeline.evaluation.protocol import protocols
 
 PROTOCOL = protocols(EvaluationConfig(group_size=4, groups=("shuffled",), pca=8), 64, "25 m")[0].grouping
-KEY = StoreKey("city", "database", "abcd", "files", PROTOCOL)
+KEY = Identity("database", "abcd", "files", PROTOCOL)
 PATHS = [Path(f"photos/{i:04d}.jpg") for i in range(50)]
 BLOCKS = blocks_of(PROTOCOL.form(50, "database"), 10, limit=12 * 10 * 4)
 VALUES = np.random.Generator(np.random.PCG64(0)).normal(size=(50, 10)).astype(np.float32)
 PLACES = np.stack([np.arange(50) * 10.0, np.arange(50) * 20.0], axis=1)
 
 
-def write(folder: Path, key: StoreKey = KEY, parts: int | None = None) -> StoreWriter:
-    writer = StoreWriter(folder, key, PATHS, PLACES, len(BLOCKS), {"dim": 768})
+def at(folder: Path) -> Path:
+    return store_folder(folder, "city", PROTOCOL, "database")
+
+
+def write(folder: Path, key: Identity = KEY, parts: int | None = None) -> StoreWriter:
+    writer = StoreWriter(at(folder), key, PATHS, PLACES, len(BLOCKS), {"dim": 768})
     for number, block in list(enumerate(BLOCKS))[:parts]:
         if number not in writer.done:
             positions = np.concatenate(block)
@@ -37,7 +42,7 @@ def write(folder: Path, key: StoreKey = KEY, parts: int | None = None) -> StoreW
 
 def test_any_parquet_reader_opens_it_and_finds_the_protocol(tmp_path: Path) -> None:
     folder = write(tmp_path).folder
-    assert folder == tmp_path / "descriptors" / "city" / "shuffled4" / "database" and len(BLOCKS) == 5
+    assert folder == tmp_path / "descriptors" / "city" / "shuffled4_64px" / "database" and len(BLOCKS) == 5
     table = pa.concat_tables(pq.read_table(f) for f in sorted(folder.glob("*.parquet"))).sort_by("row")
     assert table["key"].to_pylist() == [str(p) for p in PATHS]
     assert (np.array(table["descriptor"].to_pylist(), np.float32) == VALUES).all()
@@ -69,7 +74,7 @@ def test_a_killed_run_continues_behind_its_last_part(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="2 of 5 parts"):
         DescriptorStore(folder)
     before = {f.name: f.stat().st_mtime_ns for f in folder.glob("*.parquet")}
-    writer = StoreWriter(tmp_path, KEY, PATHS, PLACES, len(BLOCKS))
+    writer = StoreWriter(at(tmp_path), KEY, PATHS, PLACES, len(BLOCKS))
     assert writer.done == {0, 1} and not writer.complete and not list(folder.glob("*.tmp"))
     assert write(tmp_path).complete
     assert all((folder / name).stat().st_mtime_ns == when for name, when in before.items())
@@ -79,7 +84,7 @@ def test_a_killed_run_continues_behind_its_last_part(tmp_path: Path) -> None:
 @pytest.mark.parametrize("change", [{"model": "other"}, {"files": "other"}])
 def test_parts_of_another_key_are_removed(tmp_path: Path, change: dict[str, str]) -> None:
     write(tmp_path)
-    writer = StoreWriter(tmp_path, dataclasses.replace(KEY, **change), PATHS, PLACES, len(BLOCKS))
+    writer = StoreWriter(at(tmp_path), dataclasses.replace(KEY, **change), PATHS, PLACES, len(BLOCKS))
     assert writer.done == frozenset() and not list(writer.folder.glob("part-*"))
 
 
@@ -98,7 +103,7 @@ def test_the_digest_of_files_sees_a_rewritten_photo(tmp_path: Path) -> None:
 
 def test_reading_holds_a_part_at_a_time(tmp_path: Path) -> None:
     paths = [Path("x.jpg")] * 8000
-    writer = StoreWriter(tmp_path, KEY, paths, None, 40)
+    writer = StoreWriter(at(tmp_path), KEY, paths, None, 40)
     values = np.zeros((200, 500), np.float32)
     for number in range(40):
         writer.put(number, np.arange(200 * number, 200 * number + 200), values + number)

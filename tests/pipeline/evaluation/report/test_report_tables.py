@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from pipeline.evaluation.report.page import write_page
 from pipeline.evaluation.report.pictures import draw
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
-CONFIG = EvaluationConfig(recalls=(1, 5, 10), group_size=8)
+CONFIG = EvaluationConfig(recalls=(1, 5, 10), group_size=8, resize="published")
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +66,7 @@ def test_the_table_has_all_groupings_together_and_the_paper_beside(
     tables.show(results_of(street) + results_of(other))
     text = capsys.readouterr().out
     lines = text.splitlines()
-    assert [line.split()[0] for line in lines[2:5]] == ["pitts30k", "shuffled8", "ordered8"]
+    assert [line.split()[0] for line in lines[2:5]] == ["pitts30k", "shuffled8_published", "ordered8_published"]
     assert lines[2].endswith("91.6 / 95.7 / 96.9")  # the paper, each image alone
     assert lines[4].endswith("94.8 / 97.4 / 98.1")  # the paper, 8 neighbours, no PCA
     assert lines[3].endswith(" -") and max(map(len, lines[:9])) < 120
@@ -76,8 +77,27 @@ def test_the_table_has_all_groupings_together_and_the_paper_beside(
 def test_a_set_without_a_matching_protocol_shows_the_headline_in_its_own_row(street: EvaluationSet) -> None:
     table = tables.table(results_of(street, dataclasses.replace(CONFIG, groups=("shuffled",))))
     rows = [dict(zip(table.head, row, strict=True)) for row in table.rows]
-    assert [row["protocol"] for row in rows] == ["shuffled8", "paper: ordered8, PCA 4096"]
+    assert [row["protocol"] for row in rows] == ["shuffled8_published", "paper: ordered8, PCA 4096"]
     assert rows[1]["R@1"] == "94.9"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"resize": "antialias"}, {"rule": "10 m"}, {"image_size": 322}, {"group_size": 16}, {"pca": 4096},
+     {"pca": 4096, "pca_source": "tokyo247"}, {"precision": "bf16"}, {"search": "hnsw"}, {"rerank": 10}],
+)  # fmt: skip
+def test_the_papers_figures_stand_beside_the_papers_protocol_alone(
+    street: EvaluationSet, change: dict[str, Any]
+) -> None:
+    theirs = next(result for result in results_of(street) if result.protocol.groups == "ordered")
+    theirs = dataclasses.replace(theirs, without_positives=0)
+    pca = dataclasses.replace(theirs.protocol, pca=4096, pca_source="data/pitts30k")
+    for protocol, first in ((theirs.protocol, 94.8), (pca, 94.9)):
+        figures = tables.paper_figures(dataclasses.replace(theirs, protocol=protocol))
+        assert figures is not None and figures.at(1) == first
+    other = dataclasses.replace(theirs.protocol, **change)
+    beside = tables.paper_figures(dataclasses.replace(theirs, protocol=other))
+    assert beside is None or (change == {"group_size": 16} and beside.at(1) == 93.7)  # a figure of the supplement
 
 
 def test_files_say_the_same(street: EvaluationSet, tmp_path: Path) -> None:
@@ -86,7 +106,7 @@ def test_files_say_the_same(street: EvaluationSet, tmp_path: Path) -> None:
     plain = tables.read_json(tmp_path / "results.json")
     first = plain["results"][0]
     assert plain["checkpoint"] == "x" and first["protocol"]["groups"] == "single"
-    assert first["metrics"] == {f"pitts30k.single.recall_at_{k}": v for k, v in results[0].recalls.items()}
+    assert first["metrics"] == {f"pitts30k.single_published.recall_at_{k}": v for k, v in results[0].recalls.items()}
     tables.write_csv(results, tmp_path / "results.csv")
     with (tmp_path / "results.csv").open() as file:
         lines = list(csv.DictReader(file))
@@ -167,9 +187,14 @@ def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
     assert not any("no positive and are" in note or "best" in note for note in tables.notes(results[2:]))
     pictures = draw(results, sets, tmp_path / "figures", Corner())
     drawn = {p.path.name for p in pictures}
-    assert drawn >= {"pitts30k.curves.png", "seq.single.errors.png", "seq.single.worst.jpg", "seq.attention.jpg"}
+    assert drawn >= {
+        "pitts30k.curves.png",
+        "seq.single_published_2frames.errors.png",
+        "seq.single_published_2frames.worst.jpg",
+        "seq.attention.jpg",
+    }
     assert {name for name in drawn if name.startswith("unknown")} == {
-        "unknown.single.answers.jpg",
+        "unknown.single_published.answers.jpg",
         "unknown.attention.jpg",
     }
     write_page(results, pictures, tmp_path / "report.html", "A <test>", {"checkpoint": "a&b"})

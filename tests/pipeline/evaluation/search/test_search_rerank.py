@@ -97,7 +97,7 @@ def test_only_the_arrangement_tells_the_twin(scrambled: EvaluationSet) -> None:
     before = evaluate(Colours(), [scrambled], dataclasses.replace(config, rerank=0), "cpu", progress=False)[0]
     after = evaluate(Colours(), [scrambled], config, "cpu", progress=False)[0]
     assert before.recalls[1] < 60 and after.recalls[1] == 100
-    assert before.protocol.name == "single" and after.protocol.name == "single_rerank4"
+    assert before.protocol.name == "single_64px_pairs" and after.protocol.name == "single_64px_pairs_rerank4"
     assert "first 4 re-ranked" in after.protocol.describe() and "re-ranked" not in before.protocol.describe()
     four = evaluate(Colours(), [scrambled], dataclasses.replace(config, rerank=0, recalls=(4,)), "cpu", progress=False)
     assert (np.sort(after.predictions[:, :4]) == np.sort(four[0].predictions)).all()  # the same four, in another order
@@ -178,7 +178,7 @@ def test_a_layer_is_part_of_the_protocol_and_one_that_is_not_there_is_refused(sc
     model = tiny_model("transformer")
     asked = EvaluationConfig(groups=("single",), recalls=(1,), workers=0, rerank=2, rerank_layer=1)
     (result,) = evaluate(model, [scrambled], asked, "cpu", progress=False)
-    assert result.protocol.name == "single_rerank2l1" and "patches of layer 1" in result.protocol.describe()
+    assert result.protocol.name == "single_28px_pairs_rerank2l1" and "patches of layer 1" in result.protocol.describe()
     with pytest.raises(UsageError, match="layer 9"):
         evaluate(model, [scrambled], dataclasses.replace(asked, rerank_layer=9), "cpu", progress=False)
 
