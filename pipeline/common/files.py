@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
 import os
 import stat
 import tempfile
@@ -58,6 +59,12 @@ def write_atomically(path: Path, data: bytes, temporary: Path | None = None) -> 
         os.fsync(stream.fileno())
     temporary.rename(path)
     sync_path(path.parent)
+
+
+def sha256_of(path: Path) -> str:
+    """Hex digest of a file's bytes."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def check_writable(folder: Path, option: str) -> None:

@@ -294,6 +294,26 @@ def changed(config: Any, default: Any) -> dict[str, Any]:
     return {name: value for name, value in flatten(config).items() if value != before.get(name)}
 
 
+def nested(flat: Any) -> dict[str, Any]:
+    """The opposite of `flatten`: `{"data.order": x}` -> `{"data": {"order": x}}`.
+
+    Raises:
+        UsageError: it is no such dict.
+    """
+    if not isinstance(flat, dict):
+        raise UsageError(f"the config must be settings with dotted names; it is {shortened(flat)}")
+    values: dict[str, Any] = {}
+    for name, value in flat.items():
+        *sections, last = str(name).split(".")
+        inner: Any = values
+        for section in sections:
+            inner = inner.setdefault(section, {})
+            if not isinstance(inner, dict):
+                raise UsageError(f"{shortened(name)} stands beside a setting {shortened(section)}")
+        inner[last] = value
+    return values
+
+
 def from_dict(kind: type, values: Any, where: str = "", base: Any = None) -> Any:
     """Builds dataclass `kind` from plain values, as in a checkpoint, also one written under a setting's former name.
 

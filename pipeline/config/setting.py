@@ -194,6 +194,8 @@ def wanted(field: dataclasses.Field[Any], hint: Any) -> str:
     if typing.get_origin(hint) is tuple:
         many = "a list, each " if about.get("may_be_empty", True) else "a list of at least one, each "
         return many + wanted(field, typing.get_args(hint)[0])
+    if typing.get_origin(hint) is dict:
+        return "names, each with " + wanted(field, typing.get_args(hint)[1])
     if typing.get_origin(hint) is Literal:
         return "one of " + ", ".join(map(str, typing.get_args(hint)))
     if hint is bool:
@@ -224,6 +226,11 @@ def _fitting(about: Any, hint: Any, value: Any) -> Any:
             raise ValueError
         items = tuple(_fitting({**about, "may_be_empty": False}, typing.get_args(hint)[0], item) for item in value)
         return items
+    if typing.get_origin(hint) is dict:
+        keys, values = typing.get_args(hint)
+        if not isinstance(value, dict):
+            raise ValueError
+        return {_fitting({}, keys, key): _fitting(about, values, inner) for key, inner in value.items()}
     if typing.get_origin(hint) is Literal:
         right = any(type(value) is type(choice) and value == choice for choice in typing.get_args(hint))
     elif hint is str:

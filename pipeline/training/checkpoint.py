@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import hashlib
 import json
 import os
 import shutil
@@ -24,12 +25,20 @@ from typing import Any
 
 from torch import Tensor
 
-from pipeline.common.errors import DataError, UsageError
-from pipeline.common.files import sync_path, usual_permissions, write_atomically
-from pipeline.config import RunConfig, flatten
-from pipeline.config.setting import on_resume, present_name
+from pipeline.common.errors import DataError, UsageError, UserError
+from pipeline.common.files import sha256_of, sync_path, usual_permissions, write_atomically
+from pipeline.common.text import shown
+from pipeline.config import RunConfig, flatten, from_dict, nested
+from pipeline.config.setting import check, on_resume
 
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)  # exFAT and SMB say one of these
+FORMAT = "checkpoint 2"  # 1 told neither its format nor the digests of its files
+FILES = ("model.safetensors", "optimizer.safetensors")
+STEPS = 2**40  # more than any run takes
+
+
+def _bounded(default: Any, least: int = 0) -> Any:
+    return dataclasses.field(default=default, metadata={"at_least": least, "at_most": STEPS})
 
 
 @dataclass
@@ -46,22 +55,24 @@ class RunState:
         index: digest of the shard set's index.
         world_size: ranks that wrote it (informative; any number may continue).
         validated: the newest validation, metric name -> value, and the step it was made at (None: not yet).
+        validation: digest of the set and protocol that `best` was measured with; "" where it is not known.
         start: the same before the first step, {} where it was not measured.
         scaler: loss scale of fp16, empty otherwise.
         mined: the descriptors that the epoch is planned from: file, sha256, epoch they were made at; {}: none yet.
     """
 
-    step: int = 0
-    epoch: int = 0
-    cursor: int = 0
-    best: float | None = None
-    best_step: int | None = None
-    stale: int = 0
-    run_id: str = ""
-    index: str = ""
-    world_size: int = 1
+    step: int = _bounded(0)
+    epoch: int = _bounded(0)
+    cursor: int = _bounded(0)
+    best: float | None = dataclasses.field(default=None, metadata={"at_least": 0, "at_most": 100})
+    best_step: int | None = _bounded(None)
+    stale: int = _bounded(0)
+    run_id: str = dataclasses.field(default="", metadata={"may_be_empty": True})
+    index: str = dataclasses.field(default="", metadata={"may_be_empty": True})
+    world_size: int = _bounded(1, 1)
     validated: dict[str, float] = dataclasses.field(default_factory=dict)
-    validated_step: int | None = None
+    validated_step: int | None = _bounded(None)
+    validation: str = dataclasses.field(default="", metadata={"may_be_empty": True})
     start: dict[str, float] = dataclasses.field(default_factory=dict)
     scaler: dict[str, float] = dataclasses.field(default_factory=dict)
     mined: dict[str, str | int] = dataclasses.field(default_factory=dict)
@@ -93,8 +104,13 @@ def write(
         weights(temporary / "model.safetensors")
         save_file({k: v.contiguous() for k, v in optimizer.items()}, temporary / "optimizer.safetensors")
         usual_permissions(temporary / "optimizer.safetensors")
-        told = {"state": dataclasses.asdict(state), "config": flatten(config)}
-        (temporary / "state.json").write_text(json.dumps(told, indent=1) + "\n")
+        told = {
+            "format": FORMAT,
+            "state": dataclasses.asdict(state),
+            "config": flatten(config),
+            "files": {name: _digest(temporary / name) for name in FILES},
+        }
+        (temporary / "state.json").write_text(json.dumps(told | {"digest": _own_digest(told)}, indent=1) + "\n")
         for file in temporary.iterdir():
             sync_path(file)
         sync_path(temporary)
@@ -156,6 +172,7 @@ def find(run: Path, resume: str) -> Path | None:
 
     Raises:
         UsageError: "never" on a run that has checkpoints, or a path that holds none.
+        DataError: a damaged checkpoint.
     """
     last = pointed(run, "last")
     if resume == "never":
@@ -163,6 +180,9 @@ def find(run: Path, resume: str) -> Path | None:
             raise UsageError(f"{run} already holds a run; choose another --name, or --train.resume auto to continue it")
         return None
     if resume == "auto":
+        damaged = [p for p in (run / "checkpoints").glob("step-*") if p.is_dir() and not (p / "state.json").exists()]
+        if damaged:  # a folder is complete or absent, so somebody took it away
+            raise DataError(f"checkpoint {max(damaged)} has no state.json; remove it to resume from an older one")
         # between the two renames of a rewrite only the newest complete folder may be there, not the link's target
         complete = sorted((run / "checkpoints").glob("step-*/state.json"))
         return last if last is not None else (complete[-1].parent.resolve() if complete else None)
@@ -178,26 +198,61 @@ def find(run: Path, resume: str) -> Path | None:
 
 
 def read(path: Path) -> tuple[RunState, dict[str, Any], dict[str, Tensor]]:
-    """State, flat config and optimiser tensors of a checkpoint; its weights are read by `pipeline.model.weights.files`.
+    """State, flat config (under today's names) and optimiser tensors of a checkpoint, checked against its own digests.
+
+    Its weights are read by `pipeline.model.weights.files`.
 
     Raises:
-        DataError: a file is missing or not what it should be.
+        DataError: a file is missing, not what was written, or holds a value that no run has.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     try:
-        told = json.loads((path / "state.json").read_text())
-        return RunState(**told["state"]), told["config"], load_file(path / "optimizer.safetensors")
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"checkpoint {path} cannot be read ({error}); remove it to resume from an older one") from error
+        state, config = _told(path)
+        return state, config, load_file(path / "optimizer.safetensors")
+    except (OSError, SafetensorError, UserError, ValueError, KeyError, TypeError, RecursionError) as error:
+        told = error if isinstance(error, UserError) else shown(error)
+        raise DataError(f"checkpoint {path} cannot be read ({told}); remove it to resume from an older one") from error
+
+
+def _told(path: Path) -> tuple[RunState, dict[str, Any]]:
+    """`state.json`, checked. Raises what `read` makes one line of."""
+    told = json.loads((path / "state.json").read_bytes())
+    if not isinstance(told, dict) or not isinstance(told.get("state"), dict):
+        raise DataError("state.json is not that of a checkpoint")
+    if set(told) != {"state", "config"}:  # format 1
+        if told.get("format") != FORMAT:
+            raise DataError(f"state.json is of format {shown(told.get('format'))}, this is {FORMAT}")
+        if told.pop("digest", None) != _own_digest(told):
+            raise DataError("state.json was changed after it was written")
+        for name in FILES:
+            if told["files"][name] != _digest(path / name):
+                raise DataError(f"{name} is not the file that was written with it")
+    surplus = set(told["state"]) - {field.name for field in dataclasses.fields(RunState)}
+    if surplus:
+        raise DataError(f"state.json has an unknown value {shown(min(surplus))}")
+    state = RunState(**told["state"])
+    check(state)
+    last = max(state.epoch, state.cursor, state.best_step or 0, state.validated_step or 0)
+    if last > state.step:
+        raise DataError(f"state.json tells of step {state.step}, epoch {state.epoch}, batch {state.cursor} of it")
+    return state, flatten(from_dict(RunConfig, nested(told["config"])))
+
+
+def _digest(path: Path) -> dict[str, Any]:
+    return {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
+
+
+def _own_digest(told: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
 
 def check_same(saved: dict[str, Any], config: RunConfig, state: RunState, index: str) -> None:
     """Refuses to continue a run under settings that would change what a step computes.
 
     Args:
-        saved: the flat config of the checkpoint. A setting it lacks is younger than it and had its default's effect.
+        saved: the flat config of the checkpoint, from `read`: a setting that is younger than it has its default.
         config: of the run that wants to continue.
         state: of the checkpoint.
         index: digest of the shard set's index now.
@@ -205,16 +260,15 @@ def check_same(saved: dict[str, Any], config: RunConfig, state: RunState, index:
     Raises:
         UsageError: names the first setting that differs, with both values.
     """
-    before = flatten(RunConfig()) | {present_name(RunConfig, key): value for key, value in saved.items()}
     now, rules = flatten(config), on_resume(RunConfig)
-    for key in sorted(set(before) | set(now)):
+    for key in sorted(set(saved) | set(now)):
         rule = rules.get(key, "refused")
         if rule == "free" or (rule != "refused" and config.train.schedule != "cosine"):
             continue
-        if before.get(key) != now.get(key):
+        if saved.get(key) != now.get(key):
             why = "" if rule == "refused" else ", and the rate of train.schedule cosine follows from it"
             raise UsageError(
-                f"cannot resume {config.name}: {key} was {before.get(key)!r} and is now {now.get(key)!r}{why}; "
+                f"cannot resume {config.name}: {key} was {saved.get(key)!r} and is now {now.get(key)!r}{why}; "
                 "put it back, or choose another --name"
             )
     if state.index != index:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pipeline.common.errors import DataError, UsageError
-from pipeline.common.files import usual_permissions
+from pipeline.common.files import sha256_of, usual_permissions
 from pipeline.config import ModelConfig, from_dict, to_dict
 from pipeline.model.bank import bank_beside, read_bank
 from pipeline.model.vpr import PlaceModel, build_model
@@ -189,6 +189,25 @@ def checkpoint_file(path: str | Path) -> Path:
     raise UsageError(f"{given}: no model there (a .safetensors file, a checkpoint folder, or a run folder is wanted)")
 
 
+def check_digest(file: Path) -> None:
+    """Refuses a file that is not the one its checkpoint was written with, where `state.json` beside it tells.
+
+    Raises:
+        DataError: the file was changed or damaged since, or `state.json` is.
+    """
+    note = file.parent / "state.json"
+    if not note.is_file():
+        return
+    try:
+        told = json.loads(note.read_bytes()).get("files")  # checkpoints of before had none
+        wanted = None if told is None else told[file.name]
+        found = None if told is None else {"bytes": file.stat().st_size, "sha256": sha256_of(file)}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise DataError(f"{note}: damaged ({message(error)}); take another checkpoint") from None
+    if wanted != found:
+        raise DataError(f"{file}: not the file that was written with this checkpoint; copy it again, or take another")
+
+
 def load_model(path: str | Path, device: torch.device | str = "cpu") -> PlaceModel:
     """The model of a file, checkpoint folder or run folder (`outputs/<name>`), in eval mode.
 
@@ -197,6 +216,7 @@ def load_model(path: str | Path, device: torch.device | str = "cpu") -> PlaceMod
     """
     file = checkpoint_file(path)
     metadata = read_metadata(file)
+    check_digest(file)
     config: ModelConfig = metadata["config"]
     if metadata["everything"]:
         model = without_weights(config, metadata["image_size"])

@@ -12,7 +12,7 @@ import pytest
 
 from jobs.cli import parse
 from pipeline.common.errors import UsageError
-from pipeline.config import ModelConfig, RunConfig, TrainConfig, flatten, from_dict, to_dict
+from pipeline.config import ModelConfig, RunConfig, TrainConfig, flatten, from_dict, nested, to_dict
 from pipeline.config.setting import changing, leaves, on_resume, type_hints
 
 SETTINGS = dict(leaves(RunConfig))
@@ -27,11 +27,7 @@ def hint_of(name: str) -> Any:
 
 def built(name: str, value: Any) -> RunConfig:
     """The default run with one setting replaced, as a checkpoint's config would give it."""
-    *sections, last = name.split(".")
-    values: dict[str, Any] = {last: value}
-    for section in reversed(sections):
-        values = {section: values}
-    config: RunConfig = from_dict(RunConfig, values)
+    config: RunConfig = from_dict(RunConfig, nested({name: value}))
     return config
 
 

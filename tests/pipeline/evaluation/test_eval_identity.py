@@ -19,6 +19,7 @@ from pipeline.config import (
     ModelConfig,
     PoolingConfig,
     from_dict,
+    nested,
     to_dict,
 )
 from pipeline.config.setting import alternatives, leaves, on_resume, type_hints
@@ -63,11 +64,7 @@ def another(name: str, config: ModelConfig) -> ModelConfig:
     else:
         changed = value + 1 if kind is int else value * 0.5 + 0.01
         changed = value - 1 if about["at_most"] == value else changed
-    *sections, last = name.split(".")
-    values: dict[str, Any] = {last: changed}
-    for section in reversed(sections):
-        values = {section: values}
-    made: ModelConfig = from_dict(ModelConfig, values, base=config)
+    made: ModelConfig = from_dict(ModelConfig, nested({name: changed}), base=config)
     return made
 
 
