@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import inspect
 import os
 import shutil
@@ -24,9 +25,9 @@ from typing import Any, Literal, NoReturn, TypeVar
 
 from pipeline.common.errors import UsageError, UserError
 from pipeline.common.text import shown
-from pipeline.config import RunConfig, from_dict
+from pipeline.config import RunConfig, from_dict, nested
 from pipeline.config.setting import alternatives, did_you_mean, present_name
-from pipeline.config.words import file_settings, from_text, put
+from pipeline.config.words import file_settings, from_text
 
 Config = TypeVar("Config")
 
@@ -80,8 +81,8 @@ def parse(
     values: dict[str, Any] = {}
     for name, text in _pairs(kind, words, hints):
         for setting, value in file_settings(kind, text) if name == "config" else [(name, from_text(hints[name], text))]:
-            put(values, setting, value)
-    built: Config = from_dict(kind, values)
+            values[setting] = value
+    built: Config = from_dict(kind, nested(values))
     return built
 
 
@@ -183,6 +184,7 @@ def _command(program: str) -> str:
     return f"python -m {program}" if program.startswith("jobs.") else program
 
 
+@functools.cache
 def _docs(kind: type) -> dict[str, str]:
     """Field -> its docstring, of this class alone."""
     from docstring_parser import parse_from_object

@@ -258,12 +258,9 @@ class RunConfig(Settings):
         Raises:
             UsageError: no such file, not YAML, an unknown setting, or a value outside its type or range.
         """
-        from pipeline.config.words import file_settings, put
+        from pipeline.config.words import file_settings
 
-        values: dict[str, Any] = {}
-        for name, value in [*file_settings(cls, str(path)), *(changes or {}).items()]:
-            put(values, name, value)
-        built: RunConfig = from_dict(cls, values)
+        built: RunConfig = from_dict(cls, nested(dict(file_settings(cls, str(path))) | dict(changes or {})))
         return built
 
 

@@ -93,14 +93,6 @@ def file_settings(kind: type, path: str) -> list[tuple[str, Any]]:
     return found
 
 
-def put(values: dict[str, Any], name: str, value: Any) -> None:
-    """values["a"]["b"] = value for the name a.b; sections are made where they are missing."""
-    *sections, last = name.split(".")
-    for section in sections:
-        values = values.setdefault(section, {})
-    values[last] = value
-
-
 def read_texts(content: bytes | str, where: str) -> Any:
     """YAML with every scalar as its text. Raises `UsageError`."""
     try:

@@ -180,7 +180,7 @@ def _word(value: Any) -> str:
     plain = re.sub(
         r"[^A-Za-z0-9.]+", "-", text.replace(" m", "m").replace("+-", "").replace(" frames", "frames")
     ).strip("-.")[:WORD]
-    lossless = plain == text or re.fullmatch(r"[0-9.e]+ m|\+-[0-9]+ frames|listed positives", text)
+    lossless = plain == text or re.fullmatch(r"[0-9.e]+ m|\+-[0-9]+ frames|listed positives|no ground truth", text)
     return plain if lossless else f"{plain}-{hashlib.sha256(text.encode()).hexdigest()[:6]}"
 
 

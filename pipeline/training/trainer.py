@@ -152,6 +152,7 @@ class Trainer:
         self.validation: Validation | None = None
         if config.validate.sets:
             self.validation = agreed(lambda: Validation(config, accelerator.device), what="reading validate.sets")
+        self._compare_scores()
         self.training_bank = TrainingBank(config, self.index, accelerator.device)
         self.bank: tuple[int, Bank | None] = (-1, None)
 
@@ -297,6 +298,23 @@ class Trainer:
                 },
                 state.step,
             )
+
+    def _compare_scores(self) -> None:
+        """Forgets the best score where it is of another validation set or protocol than the scores to come."""
+        if self.validation is None:
+            return
+        state, now = self.state, on_rank_0(self.validation.identity, what="the validation set")
+        if state.validation not in ("", now):
+            if self.main and state.best is not None:
+                print(
+                    f"validation has another set or protocol than before: the best score so far ({state.best:.1f}) is "
+                    "not compared, the best checkpoint is chosen anew",
+                    file=sys.stderr,
+                    flush=True,
+                )
+            state.best, state.best_step, state.stale = None, None, 0
+            state.validated, state.validated_step, state.start = {}, None, {}
+        state.validation = now
 
     def _validate(self) -> None:
         """Recall of the model as it is; keeps the best, counts the epochs without a better one."""

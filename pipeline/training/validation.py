@@ -7,6 +7,8 @@ section 4.2: R@5), as computed by `pipeline.evaluation`; nothing is measured twi
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import sys
 from typing import Any
 
@@ -35,6 +37,7 @@ class Validation:
             raise UsageError(
                 "validate.rerank: a checkpoint is chosen by the recall of its descriptors; re-rank in jobs.evaluate"
             )
+        self.image_size = config.data.image_size
         # R@5 chooses the best checkpoint, whatever else is asked for
         recalls = tuple(sorted({*config.validate.recalls, 5}))
         self.config = dataclasses.replace(config.validate, recalls=recalls)
@@ -46,6 +49,22 @@ class Validation:
                     "set, and let jobs.evaluate export this one's predictions"
                 )
         self.device = device
+
+    def identity(self) -> str:
+        """Sixteen hex digits of what the score is of: the first set's images and positives, and its protocol.
+
+        Scores of two identities are not compared. Names and sizes of images count, not where they lie.
+        """
+        from pipeline.evaluation.protocol import protocols
+
+        first = self.sets[0]
+        protocol = protocols(self.config, self.image_size, first.rule)[0]
+        seen = hashlib.sha256(json.dumps([first.name, protocol.to_dict()], sort_keys=True).encode())
+        for paths in (first.database, first.queries):
+            seen.update(json.dumps([(path.name, path.stat().st_size) for path in paths]).encode())
+        for positives in first.positives:
+            seen.update(positives.tobytes() + b"|")
+        return seen.hexdigest()[:16]
 
     def run(self, model: nn.Module, show: bool) -> tuple[dict[str, float], float]:
         """Recalls by metric name, and the score; collective, the same on every rank."""

@@ -66,14 +66,19 @@ def test_one_process_and_two_write_the_same_figures(run_folder: Path) -> None:
     assert "left out: pitts30k" in alone.stderr
     assert all(
         name in alone.stdout
-        for name in ("single_pca6_28px", "shuffled4_pca6_28px", "ordered4_pca6_28px", "report.html")
+        for name in (
+            "single_pca6_from-aisle_56px",
+            "shuffled4_pca6_from-aisle_56px",
+            "ordered4_pca6_from-aisle_56px",
+            "report.html",
+        )
     )
     out = run_folder / "run" / "evaluation"
     results = json.loads((out / "results.json").read_text())
     assert [r["database"] for r in results["results"]] == [21] * 3 and results["left_out"][0].startswith("pitts30k")
     assert results["model"]["backbone"]["dim"] == 16 and len(results["fingerprint"]) == 16
     assert (out / "report.html").stat().st_size > 50_000 and (out / "figures" / "aisle.curves.png").is_file()
-    assert (out / "descriptors/aisle/single_28px/database/part-00000.parquet").is_file()
+    assert (out / "descriptors/aisle/single_56px/database/part-00000.parquet").is_file()
     kept = sorted((run_folder / "run/checkpoints/best").glob("pca-6.aisle.*.safetensors"))
     assert len(kept) == 3
     changed = [f.stat().st_mtime_ns for f in kept]
@@ -117,7 +122,8 @@ def test_the_challenge_is_written_in_the_line_format_of_its_server(run_folder: P
     job = JobProcess("jobs.evaluate", [*options, "--figures", "false"], run_folder / "challenge.log")
     assert job.wait(240) == 0, job.text()
     assert "single" in job.text()
-    lines = (run_folder / "challenge/predictions/msls_challenge.single_28px.txt").read_text().splitlines()
+    (written,) = (run_folder / "challenge/predictions").glob("msls_challenge.single_56px*.txt")
+    lines = written.read_text().splitlines()
     assert sorted(line.split()[:2] for line in lines) == sorted(
         [f"{city}_q{i}", f"{city}_d{i}"] for city in ("athens", "miami") for i in range(2)
     )

@@ -199,8 +199,8 @@ def test_values_show_mean_and_spread_over_seeds(root: Path) -> None:
     assert str(values.Value((50.0,))) == "50.0"
     filled = built(root, "kernels", (0, 1))
     name = next(iter(filled.sets.values())).name
-    filled.values["5x5", name, "ordered16"] = {1: [40.0, 44.0], 5: [80.0, 80.0]}
-    filled.values["3x3", name, "ordered16"] = {1: [40.0], 5: [80.0]}
+    filled.values["5x5", name, "ordered16_28px"] = {1: [40.0, 44.0], 5: [80.0, 80.0]}
+    filled.values["3x3", name, "ordered16_28px"] = {1: [40.0], 5: [80.0]}
     table = table_report.table(filled, str(root / "evaluation"))
     rows = table.rows
     assert table.head == ["row", "single", "shuffled16", "ordered16", "paper: pitts30k, ordered8"]

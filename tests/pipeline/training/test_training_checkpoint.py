@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from pipeline.common.errors import DataError, UsageError
-from pipeline.config import RunConfig, TrainConfig, flatten
+from pipeline.config import DataConfig, RunConfig, TrainConfig, flatten
 from pipeline.training import checkpoint
 from pipeline.training.checkpoint import RunState
 from pipeline.training.schedule import learning_rate
@@ -88,12 +89,36 @@ def test_a_broken_checkpoint_is_named(tmp_path: Path) -> None:
     (path / "optimizer.safetensors").write_bytes(b"\x00" * 20)
     with pytest.raises(DataError, match="step-00000001 cannot be read"):
         checkpoint.read(path)
+    (path / "state.json").unlink()
+    with pytest.raises(DataError, match=r"step-00000001 has no state\.json"):
+        checkpoint.find(tmp_path, "auto")  # it would otherwise start anew in silence
+
+
+def test_checkpoints_of_before_are_read_under_todays_names(tmp_path: Path) -> None:
+    """Format 1: no digests, and settings that have been renamed or did not exist yet."""
+    path = save(tmp_path, 5)
+    told = json.loads((path / "state.json").read_text())
+    old = {"state": told["state"], "config": told["config"]}
+    old["state"].pop("validation")
+    old["config"] |= {"train.clip": 2.0, "model.train": "full"}
+    for name in ("train.max_grad_norm", "model.trainable", "loss.ignore_within"):
+        old["config"].pop(name)
+    (path / "state.json").write_text(json.dumps(old))
+    state, config, _ = checkpoint.read(path)
+    assert (state.step, config["train.max_grad_norm"], config["model.trainable"]) == (5, 2.0, "full")
+    assert set(config) == set(flatten(RunConfig()))
 
 
 def test_only_free_settings_may_change() -> None:
     saved, state = flatten(RunConfig()), RunState(index="abc")
     free = RunConfig(train=dataclasses.replace(TrainConfig(), epochs=3, log_every=1))
     checkpoint.check_same(saved, free, state, "abc")
+    cached = RunConfig(data=DataConfig(cache_gb=1.0, workers=0))
+    checkpoint.check_same(saved, cached, state, "abc")
+    cosine = RunConfig(train=TrainConfig(schedule="cosine"))
+    longer = RunConfig(train=TrainConfig(schedule="cosine", epochs=20))
+    with pytest.raises(UsageError, match=r"train\.epochs was 10 and is now 20, and the rate of train\.schedule cosine"):
+        checkpoint.check_same(flatten(cosine), longer, state, "abc")
     with pytest.raises(UsageError, match=r"seed was 0 and is now 1"):
         checkpoint.check_same(saved, RunConfig(seed=1), state, "abc")
     with pytest.raises(UsageError, match="not those it started with"):
