@@ -1,7 +1,7 @@
 """Fill a table of the paper, row by row: trains and evaluates what is missing, puts the paper's figures beside ours.
 
     python -m jobs.experiment --table ablation_crica --config jobs/configs/paper.yaml --root data --seeds 0,1,2
-    python -m jobs.experiment --table kernels --config jobs/configs/paper.yaml --dry-run
+    python -m jobs.experiment --table kernels --config jobs/configs/paper.yaml --dry_run
     python -m jobs.experiment --table spm --launch "accelerate launch --config_file jobs/accelerate/ddp.yaml"
 
 The configuration gives sizes and data, the table's rows change what the paper's table says. Killed, it continues.
@@ -43,7 +43,7 @@ class ExperimentJob(RunConfig):
     resnet_weights: str | None = None
     """same_data: ImageNet weights of ResNet-50 for NetVLAD, CosPlace, GeM and MixVPR; none: random weights."""
     images_per_second: float | None = None
-    """Measured training speed, for the estimate of --dry-run; none: what recorded runs of the same rows reached."""
+    """Measured training speed, for the estimate of --dry_run; none: what recorded runs of the same rows reached."""
     dry_run: bool = False
     """Say which rows, trainings and sets there are, what they cost and what is missing; do nothing."""
     measure: str = ""

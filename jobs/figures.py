@@ -2,7 +2,7 @@
 
     python -m jobs.figures --kind parameters --to figures/parameters.md
     python -m jobs.figures --kind attention --checkpoint outputs/RUN --photos a.jpg,b.jpg --to figures/attention.jpg
-    python -m jobs.figures --kind tsne --checkpoint outputs/RUN --places-from data/gsv --to figures/places.png
+    python -m jobs.figures --kind tsne --checkpoint outputs/RUN --places_from data/gsv --to figures/places.png
     python -m jobs.figures --kind qualitative --checkpoint outputs/RUN --baseline outputs/OTHER --sets pitts30k \
         --to figures/retrieval.jpg
 
@@ -116,7 +116,7 @@ def places(job: FiguresJob, model: Any, device: Any) -> None:
     from pipeline.paper.place_features import choose_places, stages
 
     if not job.places_from:
-        raise UsageError("--places-from is missing: a folder in GSV-Cities' layout, or one with a folder a place")
+        raise UsageError("--places_from is missing: a folder in GSV-Cities' layout, or one with a folder a place")
     chosen = choose_places(Path(job.places_from), job.places, job.images, job.seed)
     baselines = [(_short(name), _model(name, model, device)) for name in job.baseline]
     config = _config(job)

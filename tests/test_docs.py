@@ -1,59 +1,278 @@
-"""What the documents show a person exists: their commands parse, their links and files are there."""
+"""What the documents show a person works: every shown command is run, and their links and files are there.
+
+Commands run as they are typed, with the number of processes shown, in a folder where the shown paths hold small made
+material; options that make the work small are put behind them (`SMALL`). A page's commands run in their order, so that
+a later one finds what an earlier one made. One that was run for an earlier page is not run again.
+"""
 
 from __future__ import annotations
 
-import importlib
+import os
 import re
 import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
+from job_process import JobProcess
+from tiny import make_evaluation, make_gsv, photo, run_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+# a line or a code span that begins like this is a command; `WORD=value` may stand before it
+PROGRAM = re.compile(
+    r"(?:\$ )?(?:[A-Z_]+=\S+ )*(?:python -m|accelerate launch|make|sbatch|docker|mlflow|vpr-\w+|pip)\s"
+)
+# commands that are run elsewhere, or that no test can run: the beginning, and where or why
+ELSEWHERE = {
+    "make demo": "the demo's own commands; minutes of work",
+    "make test": "this is it",
+    "sbatch": "tests/jobs/test_slurm.py",
+    "ENGINE=fsdp2 PRECISION=bf16 sbatch": "tests/jobs/test_slurm.py",
+    "accelerate launch --config_file jobs/accelerate/ddp.yaml --num_machines":
+        "tests/pipeline/training/test_training_nodes.py",
+    "accelerate launch --mixed_precision bf16 ...": "tests/pipeline/training/test_training_precision.py",
+    "python -m jobs.weights": "tests/jobs/test_job_weights_figures.py",
+    "python -m jobs.figures": "tests/jobs/test_job_weights_figures.py",
+}  # fmt: skip
+# what makes a command small, by the job (and part) it starts; later options win
+SMALL = {
+    "jobs.prepare": "--out data/shown{number} --workers 1",
+    "jobs.prepare verify": "",
+    "jobs.miniature": "--out data/drawn{number} --places 8 --val_places 4 --test_places 4 --width 96 --height 72 "
+    "--workers 1",
+    "jobs.miniature streets": "--out data/drawn{number} --places 24 --street_places 4 --val_places 8 --test_places 8 "
+    "--width 96 --height 72 --workers 1",
+    "jobs.train": "--output launched --tracking.enabled false",
+    "jobs.evaluate": "--workers 0 --figures false --track false --group_size 4",
+    "jobs.evaluate rerank": "--workers 0 --figures false --track false --rerank_layer 1",
+    "jobs.evaluate store": "--dimensions 8,4",
+    "jobs.compare": "",
+    "jobs.locate": "--workers 0",
+    "jobs.experiment": "--output tables --data.places_per_batch 4 --train.steps 1 --tracking.enabled false "
+    "--evaluate.workers 0",
+    "jobs.mine": "--workers 0",
+    "jobs.benchmark mine": "--places 300 --dim 8 --places_per_batch 8",
+    "jobs.benchmark step": "--size tiny --full false --device cpu",
+    "jobs.benchmark memory": "--size tiny",
+    "jobs.benchmark precision": "--size tiny --device cpu",
+    "jobs.benchmark data": "--size tiny",
+    "jobs.benchmark ranks": "--size tiny",
+    "jobs.benchmark engines": "--engines ddp",
+    "jobs.benchmark cost": "",
+    "jobs.benchmark search": "--rows 300 --dim 8 --queries 20 --sklearn false",
+    "jobs.benchmark search pca": "--rows 300 --dim 8 --pca 4",
+    "jobs.benchmark store": "--sizes 2000x8 --queries 4 --dims 4",
+}
+# run by `make test-slow`: another run of a job and of a launch that the default run starts already, or half a minute
+SLOW = (
+    "python -m jobs.benchmark memory", "python -m jobs.benchmark precision", "python -m jobs.benchmark data",
+    "python -m jobs.benchmark ranks", "python -m jobs.benchmark engines", "python -m jobs.benchmark search --pca",
+    "python -m jobs.benchmark store", "python -m jobs.benchmark step --size vitb",
+    "accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.train",
+    "OMP_NUM_THREADS=1 python -m jobs.experiment",
+    "python -m jobs.experiment --table ablation_crica --config jobs/configs/paper.yaml --root data --seeds",
+)  # fmt: skip
 
 
-def commands() -> list[tuple[str, str]]:
-    """(page, command) of every `-m jobs.X` in a code block or a code span."""
+@dataclass(frozen=True)
+class Shown:
+    """A command of a page."""
+
+    page: str
+    text: str
+
+    @property
+    def elsewhere(self) -> str | None:
+        return next((where for start, where in ELSEWHERE.items() if self.text.startswith(start)), None)
+
+    @property
+    def slow(self) -> bool:
+        return self.text.startswith(SLOW)
+
+    @property
+    def words(self) -> list[str]:
+        """With the options that make it small."""
+        words = shlex.split(self.text)
+        if "--help" in words:
+            return words
+        at = words.index("-m")
+        kind = words[at + 1] + (f" {words[at + 2]}" if words[at + 1] == "jobs.benchmark" else "")
+        for option, what in (("--verify", " verify"), ("--from_store", " store"), ("--pca", " pca"),
+                             ("--rerank", " rerank"), ("--street_places", " streets")):  # fmt: skip
+            kind += what if option in words and kind + what in SMALL else ""
+        return words + shlex.split(SMALL[kind].format(number=COMMANDS.index(self)))
+
+
+def shown(page: Path) -> list[Shown]:
+    """The commands of a page in their order: lines of shell blocks, and code spans."""
+    text = page.read_text().replace("\\\n", " ")
     found = []
-    for page in PAGES:
-        text = page.read_text().replace("\\\n", " ")
-        blocks = re.findall(r"```(?:sh|bash|console)?\n(.*?)```", text, re.DOTALL)
-        lines = [line.removeprefix("$ ") for block in blocks for line in block.splitlines()]
-        lines += re.findall(r"(?<!`)`([^`\n]+)`(?!`)", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
-        found += [(page.name, line.split(" #")[0].strip()) for line in lines if re.search(r"-m jobs\.\w+", line)]
-    return sorted(set(found))
+    for block, span in re.findall(r"```(?:sh|bash|console)?\n(.*?)```|(?<!`)`([^`\n]+)`(?!`)", text, re.DOTALL):
+        for line in block.splitlines() or [span]:
+            command = re.sub(r"\s+", " ", re.split(r"\s+#|\s{2,}then ", line)[0]).strip().removeprefix("$ ")
+            if PROGRAM.match(command + " ") and command != "accelerate launch":
+                found.append(Shown(page.name, command))
+    return list(dict.fromkeys(found))
 
 
-class Parsed(Exception):
-    """The command line was accepted; the job itself is not run here."""
+pytestmark = pytest.mark.timeout(1800)  # a page is many commands; a busy machine
+ALL = {page.name: shown(page) for page in PAGES}
+COMMANDS = [command for commands in ALL.values() for command in commands]
 
 
-@pytest.mark.parametrize(("page", "command"), commands(), ids=lambda value: str(value)[:60])
-def test_every_shown_command_parses(page: str, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = shlex.split(command)
-    at = words.index("-m") + 1
-    name, arguments = words[at], [w for w in words[at + 1 :] if w not in ("...", "[overrides]")]
-    for stop in ("|", "&&", ";", ">", "&"):
-        arguments = arguments[: arguments.index(stop)] if stop in arguments else arguments
-    module = importlib.import_module(name)
-    entry = "parse_part" if hasattr(module, "parse_part") else "parse"
-    real = getattr(module, entry)
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as the pages assume it: data, photos, configurations made small, and two trained runs."""
+    world = tmp_path_factory.mktemp("world")
+    (world / "jobs").mkdir()
+    (world / "jobs" / "accelerate").symlink_to(ROOT / "jobs" / "accelerate")
+    small = run_settings(world)
+    small["train"] = {"steps": 2, "epochs": 1, "validate_first": False, "log_every": 1}
+    small["data"]["workers"] = 0
+    small["model"]["backbone"]["weights"] = None
+    for name in ("name", "output", "tracking"):
+        del small[name]
+    del small["data"]["shards"], small["validate"]["sets"]
+    (world / "jobs" / "configs").mkdir()
+    for name in {word for c in COMMANDS for word in re.findall(r"jobs/configs/\S+\.yaml", c.text)}:
+        (world / name).write_text(yaml.safe_dump(over(yaml.safe_load((ROOT / name).read_text()), small)))
+    make_gsv(world / "data" / "gsv-cities")
+    (world / "data" / "city").mkdir()
+    (world / "data" / "city" / "gsv").symlink_to(world / "data" / "gsv-cities")
+    (world / "data" / "streets").symlink_to(world / "data" / "city")
+    for split in ("train", "val", "test"):
+        make_evaluation(world / "data" / "pitts30k", split=split)
+    (world / "data" / "city" / "eval").mkdir()
+    (world / "data" / "city" / "eval" / "miniature").symlink_to(world / "data" / "pitts30k")
+    for view, walk in enumerate(("day_left", "day_right", "night_right")):
+        (world / "data" / "gardens_point" / walk).mkdir(parents=True)
+        for place in range(8):
+            photo(place, view).save(world / "data" / "gardens_point" / walk / f"Image{place:03d}.jpg")
+    (world / "my" / "photos").mkdir(parents=True)
+    for number in range(6):
+        photo(number, 0).save(world / "my" / "photos" / f"{number}.jpg")
+    for name in ("query.jpg", "A.jpg", "B.jpg"):
+        photo(2, 1).save(world / name)
+    before = Path.cwd()
+    os.chdir(world)
+    try:
+        run(["jobs.prepare", "--source", "data/gsv-cities", "--out", "data/shards", "--rounds", "2"], world)
+        (world / "data" / "city_shards").symlink_to(world / "data" / "shards")
+        run(["jobs.train", "--config", "jobs/configs/cricavpr.yaml"], world)
+        run(["jobs.train", "--config", "jobs/configs/cricavpr.yaml", "--name", "no-encoder"], world)
+        run(
+            ["jobs.evaluate", "--checkpoint", "outputs/cricavpr", "--sets", "pitts30k", "--store", "fp16",
+             "--workers", "0", "--figures", "false", "--track", "false", "--group_size", "4"],
+            world,
+        )  # fmt: skip
+    finally:
+        os.chdir(before)
+    (world / "weights").mkdir()
+    shutil.copy(
+        (world / "outputs/cricavpr/checkpoints/best/model.safetensors").resolve(),
+        world / "weights" / "resnet50_gem.safetensors",
+    )
+    return world
 
-    def parse(*given: Any, **named: Any) -> Any:
-        real(*given, **named)
-        raise Parsed
 
-    monkeypatch.chdir(ROOT)
-    monkeypatch.setattr("sys.argv", [name, *arguments])
-    monkeypatch.setattr(module, entry, parse)
-    if "--help" in arguments:
-        with pytest.raises(SystemExit):
-            module.main()
-    else:
-        with pytest.raises(Parsed):
-            module.main()
+def over(values: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    both = {k: over(values[k], v) if isinstance(v, dict) and isinstance(values.get(k), dict) else v
+            for k, v in given.items()}  # fmt: skip
+    return {**values, **both}
+
+
+def run(words: list[str], world: Path) -> str:
+    """`python -m WORDS`, in a process forked from this one."""
+    job = JobProcess(words[0], words[1:], world / "log")
+    code = job.wait(900)
+    assert code == 0 and "Traceback" not in job.text(), f"{' '.join(words)}\nended with {code}:\n{job.text()[-3000:]}"
+    return job.text()
+
+
+def run_as_typed(words: list[str], world: Path) -> None:
+    """The whole command line, with its launcher, in a process group of its own."""
+    settings = {}
+    while "=" in words[0]:
+        name, _, value = words.pop(0).partition("=")
+        settings[name] = value
+    program = shutil.which(words[0], path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    assert program is not None, words[0]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **settings}
+    done = subprocess.run(
+        [program, *words[1:]], cwd=world, env=environment, capture_output=True, text=True, timeout=1200
+    )
+    assert done.returncode == 0, (
+        f"{' '.join(words)}\nended with {done.returncode}:\n{(done.stdout + done.stderr)[-4000:]}"
+    )
+
+
+DONE: set[str] = set()
+"""Commands that ran for an earlier page."""
+
+
+def run_all(commands: list[Shown], world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(world)
+    for command in commands:
+        if command.text in DONE:
+            continue
+        DONE.add(command.text)
+        words = command.words
+        if words[:2] == ["python", "-m"]:
+            run(words[2:], world)
+        else:
+            run_as_typed(words, world)
+
+
+def to_run(slow: bool) -> dict[str, list[Shown]]:
+    """Page -> what is run for it; pages without any are left out."""
+    chosen = {page: [c for c in commands if not c.elsewhere and c.slow == slow] for page, commands in ALL.items()}
+    return {page: commands for page, commands in chosen.items() if commands}
+
+
+@pytest.mark.parametrize("page", to_run(slow=False))
+def test_shown_commands_run(page: str, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_all(to_run(slow=False)[page], world, monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", to_run(slow=True))
+def test_shown_commands_that_take_longer_run(page: str, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_all(to_run(slow=True)[page], world, monkeypatch)
+
+
+def test_the_page_about_python_runs(world: Path) -> None:
+    """All its code blocks, one after the other, in a fresh interpreter; what it loads names what it says."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL)
+    assert len(blocks) >= 5
+    (world / "page.py").write_text("\n".join(blocks) + "\nassert descriptors.shape == (6, model.descriptor_dim)\n")
+    run_as_typed(["python", "page.py"], world)
+
+
+def test_every_shown_command_is_run_somewhere() -> None:
+    assert len(COMMANDS) > 30
+    for command in COMMANDS:
+        if command.elsewhere is None:
+            assert command.words, command  # SMALL knows the job
+        elif command.elsewhere.startswith("tests/"):
+            assert (ROOT / command.elsewhere).exists(), command
+    texts = [c.text for c in COMMANDS]
+    for start in (*ELSEWHERE, *SLOW):
+        assert any(text.startswith(start) for text in texts), f"no page shows {start}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_options_have_one_spelling(page: Path) -> None:
+    """Underscores, as in a YAML file; those of other programs (make, mlflow) have theirs."""
+    for command in ALL[page.name]:
+        if " jobs." in command.text:
+            wrong = [word for word in command.text.split() if re.match(r"--[a-z_.]+-", word)]
+            assert not wrong, f"{page.name}: {command.text}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
