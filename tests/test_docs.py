@@ -37,6 +37,7 @@ ELSEWHERE = {
     "accelerate launch --config_file jobs/accelerate/ddp.yaml --num_machines":
         "tests/pipeline/training/test_training_nodes.py",
     "accelerate launch --mixed_precision bf16 ...": "tests/pipeline/training/test_training_precision.py",
+    "python -m jobs.evaluate --checkpoint CricaVPR.pth": "it needs the authors' file",
     "python -m jobs.weights": "tests/jobs/test_job_weights_figures.py",
     "python -m jobs.figures": "tests/jobs/test_job_weights_figures.py",
 }  # fmt: skip
@@ -75,6 +76,8 @@ SLOW = (
     "python -m jobs.benchmark ranks", "python -m jobs.benchmark engines", "python -m jobs.benchmark search --pca",
     "python -m jobs.benchmark store", "python -m jobs.benchmark step --size vitb",
     "accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.train",
+    "python -m jobs.evaluate --checkpoint outputs/cricavpr --groups single,bank",
+    "python -m jobs.experiment --table one_photo",
     "OMP_NUM_THREADS=1 python -m jobs.experiment",
     "python -m jobs.experiment --table ablation_crica --config jobs/configs/paper.yaml --root data --seeds",
 )  # fmt: skip
