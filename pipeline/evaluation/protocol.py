@@ -52,6 +52,10 @@ class Protocol:
     """Images that share one pass of the cross-image encoder; 1 for single; for bank the images of the bank."""
     group_seed: int = named("s{}", "descriptors", 0)
     """Seed of the shuffled groups; 0 and without effect otherwise."""
+    bank_from: str = named("{}", "descriptors", "train")
+    """bank: train, map, or the folder's name."""
+    bank_digest: str = named("", "descriptors", "")
+    """bank: sixteen hex digits of its regions; empty before it is known. It is in the identity, not in the name."""
     pca: int | None = named("_pca{}", "answers", None)
     """Dimensions kept by PCA; None keeps all."""
     whiten: bool = named("w", "answers", False)
@@ -76,11 +80,6 @@ class Protocol:
     """Candidates put in order anew by matching patches in space (a second stage); 0: none, one stage."""
     rerank_layer: int | None = named("l{}", "answers", None)
     """Block or stage of the backbone whose patches were matched; None: its last."""
-
-    bank_from: str = named("{}", "descriptors", "train")
-    """bank: train, map, or the folder's name."""
-    bank_digest: str = named("", "descriptors", "")
-    """bank: sixteen hex digits of its regions; empty before it is known. It is in the identity, not in the name."""
 
     @property
     def name(self) -> str:

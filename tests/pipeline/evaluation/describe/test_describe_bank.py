@@ -131,10 +131,10 @@ def test_draws_files_and_names(tmp_path: Path, photos: EvaluationSet) -> None:
         read_bank(tmp_path / "b.safetensors")
     config = EvaluationConfig(groups=("single", "bank"))
     single, beside = protocols(config, 28, "pairs", bank)
-    assert (single.name, beside.name, beside.bank_digest) == ("single", "bank6", bank.digest)
+    assert (single.name, beside.name, beside.bank_digest) == ("single_28px_pairs", "bank6_28px_pairs", bank.digest)
     assert "bank of 6 images from train" in beside.describe()
     (other,) = protocols(EvaluationConfig(groups=("bank",)), 28, "pairs", dataclasses.replace(bank, source="my photos"))
-    assert other.name == "bank6my-photos" and other.grouping == dataclasses.replace(
+    assert other.name.startswith("bank6my-photos-") and other.grouping == dataclasses.replace(
         beside.grouping, bank_from="my photos"
     )
 
@@ -174,7 +174,7 @@ def test_every_way_to_a_descriptor_takes_the_bank_of_the_model(tmp_path: Path, p
     index = make_index(
         built, photos.database[0].parent, tmp_path / "index", config, device, "of a test", progress=False
     )
-    assert index.protocol.name == "bank6" and index.protocol.bank_digest == built.bank.digest
+    assert index.protocol.name.startswith("bank6_28px") and index.protocol.bank_digest == built.bank.digest
     answers = locate(built, index, paths, 2, device, progress=False)
     rows = [photos.database.index(path) for path in paths]
     assert [answer.rows[0] for answer in answers] == rows and max(answer.distances[0] for answer in answers) == 0
@@ -199,8 +199,8 @@ def test_training_writes_the_bank_that_chose_its_best_checkpoint(tmp_path: Path)
     config = EvaluationConfig(**{**settings["validate"], "groups": ("bank", "single"), "recalls": (1, 5)})
     evaluated = load_set(str(root / "evaluation"), config)
     results = evaluate(trained, [evaluated], config, "cpu", progress=False)
-    assert results[0].protocol.name == "bank9"
-    assert state["best"] == results[0].recalls[5] == state["validated"]["validation/evaluation.bank9.recall_at_5"]
+    assert results[0].protocol.name == "bank9_28px"
+    assert state["best"] == results[0].recalls[5] == state["validated"]["validation/evaluation.bank9_28px.recall_at_5"]
     write_model(trained, root / "copy.safetensors", str(run))
     copied = load_model(root / "copy.safetensors")
     assert copied.bank is not None and trained.bank is not None and copied.bank.digest == trained.bank.digest
