@@ -141,7 +141,7 @@ def agree(problem: BaseException | None = None, notice: int = 0, what: str = "")
         if problem is not None:
             raise (mine if mine is not None else problem)
         return notice
-    largest = torch.tensor([_PROBLEM if problem is not None else notice], device=_device())
+    largest = torch.tensor([_PROBLEM if problem is not None else notice], device=collective_device())
     dist.all_reduce(largest, op=dist.ReduceOp.MAX)
     if int(largest.item()) != _PROBLEM:
         return int(largest.item())
@@ -239,9 +239,9 @@ def broadcast_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     for name, (shape, dtype) in shapes.items():
         first = rank() == 0
         tensor = (
-            tensors[name].detach().to(_device()).contiguous()
+            tensors[name].detach().to(collective_device()).contiguous()
             if first
-            else torch.empty(shape, dtype=dtype, device=_device())
+            else torch.empty(shape, dtype=dtype, device=collective_device())
         )
         dist.broadcast(tensor, src=0)
         sent[name] = tensor.cpu()
@@ -280,8 +280,10 @@ def _joined(records: dict[int, _Record], problem: BaseException | None, mine: Us
     return error
 
 
-def _device() -> torch.device:
-    """Where collectives want their tensors."""
+def collective_device() -> torch.device:
+    """Where collectives want their tensors: NCCL this rank's GPU, gloo the CPU (it takes a GPU's, too)."""
+    if not is_distributed():
+        return torch.device("cpu")
     if torch.cuda.is_available() and "nccl" in dist.get_backend():
         return torch.device("cuda", torch.cuda.current_device())
     return torch.device("cpu")

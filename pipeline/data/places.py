@@ -215,7 +215,6 @@ class PlaceLoader:
             self.dataset,
             batch_sampler=_Steps(start_step, steps, self.places),
             collate_fn=_as_is,
-            pin_memory=torch.cuda.is_available(),
             # torch draws a seed from it that nothing here uses: the trainer's own generator stays untouched
             generator=torch.Generator(),
             **workers.options(data.workers, data.prefetch),

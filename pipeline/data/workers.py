@@ -103,10 +103,17 @@ def hand_over(*tensors: Tensor) -> None:
 
 
 def options(workers: int, prefetch: int) -> dict[str, Any]:
-    """The arguments of a `DataLoader` whose workers live and die as this module says; read it with `batches`."""
+    """The arguments of a `DataLoader` whose workers live and die as this module says; read it with `batches`.
+
+    Where there is a GPU, batches come in pinned memory, from which they are copied to it while it computes.
+    """
+    import torch
+
+    pinned = {"pin_memory": torch.cuda.is_available()}
     if workers == 0:
-        return {"num_workers": 0}
+        return {"num_workers": 0, **pinned}
     return {
+        **pinned,
         "num_workers": workers,
         "prefetch_factor": prefetch,
         "multiprocessing_context": context(),

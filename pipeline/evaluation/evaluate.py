@@ -29,6 +29,7 @@ from pipeline.evaluation.identity import Identity, files_digest, model_digest
 from pipeline.evaluation.protocol import Protocol, Side, protocols
 from pipeline.evaluation.recall import recall_at
 from pipeline.evaluation.search.approximate import agreement, build_index, index_bytes, search_index
+from pipeline.evaluation.search.cores import all_cores
 from pipeline.evaluation.search.exact import Blocks, batches, search, search_within
 from pipeline.evaluation.search.projection import Projection, fit_rows, load_projection, projected, sample_rows
 from pipeline.evaluation.search.rerank import PatchTokens, rerank
@@ -183,6 +184,7 @@ def fit_projections(
     return fitted
 
 
+@all_cores(faiss=True)
 def answer_queries(
     evaluated: EvaluationSet,
     protocol: Protocol,

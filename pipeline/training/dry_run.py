@@ -16,7 +16,7 @@ from pipeline.config import RunConfig
 from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import ShardSets, open_shards
-from pipeline.distributed import agreed, world_size
+from pipeline.distributed import agreed, collective_device, world_size
 from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
 from pipeline.training.mining import Mining
 from shards.index import ShardIndex
@@ -37,7 +37,8 @@ def saved_bytes(model: PlaceModel, images: int, joint: bool = False) -> int:
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
-        keep = model(torch.zeros(images, 3, model.image_size, model.image_size), joint=joint)
+        device = next(model.parameters()).device
+        keep = model(torch.zeros(images, 3, model.image_size, model.image_size, device=device), joint=joint)
     del keep
     return sum(seen.values())
 
@@ -94,7 +95,7 @@ def _plan_rows(config: RunConfig, index: ShardIndex) -> list[tuple[str, str]]:
 
 def _size_rows(config: RunConfig, model: PlaceModel, counts: dict[str, int]) -> list[tuple[str, str]]:
     trained, w = counts["trainable"], world_size()
-    model.train()
+    model.to(collective_device()).train()  # its forward holds collectives of all ranks
     joint = config.train.passes == "joint"
     one, three = saved_bytes(model, 4, joint), saved_bytes(model, 8, joint)
     each = max(0, three - one) / 4

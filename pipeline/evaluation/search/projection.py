@@ -23,6 +23,7 @@ from torch import Tensor
 
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import usual_permissions
+from pipeline.evaluation.search.cores import all_cores
 from pipeline.evaluation.search.exact import Blocks
 
 SAMPLE = 16_384  # rows at most that PCA is fitted on (published: the same)
@@ -93,6 +94,7 @@ def sample_rows(rows: int, limit: int = SAMPLE, seed: int = 0) -> np.ndarray:
     return np.sort(np.argsort(bits, kind="stable")[:limit]).astype(np.int64)
 
 
+@all_cores()
 def fit_rows(
     blocks: Blocks,
     rows: np.ndarray,

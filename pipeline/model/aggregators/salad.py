@@ -54,7 +54,8 @@ class SALAD(nn.Module):
         )
         self.cluster_features = self._per_patch(dim, config.channels, config)
         self.score = self._per_patch(dim, config.clusters, config)
-        self.dust_bin = nn.Parameter(torch.tensor(1.0))
+        # released as a single number; a vector here, since FSDP2 shards no parameter without a dimension
+        self.dust_bin = nn.Parameter(torch.ones(1))
 
     @staticmethod
     def _per_patch(dim: int, out: int, config: SALADConfig) -> nn.Sequential:

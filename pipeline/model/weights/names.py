@@ -106,6 +106,8 @@ def fit(
     for name, owners in names.items():
         tensor, targets = given[name], [own[o.removeprefix(prefix)] for o in owners]
         shape = [sum(len(t) for t in targets), *targets[0].shape[1:]] if targets[0].ndim else []
+        if tensor.ndim == 0 and shape == [1]:  # older files of ours hold SALAD's dustbin as a single number
+            tensor = tensor[None]
         if list(tensor.shape) != shape:
             raise UsageError(
                 f"{source} does not fit the configured model: '{name}' is {_shape(tensor.shape)} there, "

@@ -147,9 +147,10 @@ def _differs(missing: list[str], surplus: list[str]) -> str:
 
 
 def _shaped(tensor: Tensor, shape: Iterable[int], name: str, source: str) -> Tensor:
-    """Float32 of the wanted shape; a 1x1 convolution over one position is the Linear that ours is."""
+    """Float32 of the wanted shape; a 1x1 convolution over one position is the Linear that ours is, and a single number
+    a vector of one."""
     wanted, got = tuple(shape), tuple(tensor.shape)
-    if got != wanted and got != (*wanted, 1, 1):
+    if got not in (wanted, (*wanted, 1, 1)) and (got, wanted) != ((), (1,)):
         raise UsageError(
             f"{source}: '{name}' is {shape_text(got)}, where its other tensors want {shape_text(wanted)}; the file is "
             "of a variant that is not known here, or damaged"

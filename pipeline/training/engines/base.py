@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from pipeline.distributed import rank
 from pipeline.model.vpr import PlaceModel
 
+COUNTER = "step"  # the optimiser state that counts a parameter's steps; every other has the parameter's shape
 BuildOptimizer = Callable[[Iterator[nn.Parameter]], torch.optim.Optimizer]
 
 
@@ -103,11 +104,16 @@ class Engine:
             self.accelerator.scaler.load_state_dict({k: int(v) if k in integers else v for k, v in scaler.items()})
         inner = getattr(self.optimizer, "optimizer", self.optimizer)
         parameters = self.names()
+        fused = any(group.get("fused") for group in inner.param_groups)
         for key, value in optimizer.items():
             name, state = key.rsplit("/", 1)
             parameter = parameters[name]
-            # the step counter stays on the CPU, where torch's own optimisers keep it
-            inner.state[parameter][state] = value.clone() if value.ndim == 0 else placed_like(value, parameter)
+            if state == COUNTER:  # torch keeps it on the CPU, and beside the parameter where the update is fused
+                inner.state[parameter][state] = value.to(parameter.device if fused else "cpu", copy=True)
+            else:
+                inner.state[parameter][state] = placed_like(
+                    value if parameter.ndim == 0 else as_moment(value), parameter
+                )
 
     @contextmanager
     def plain(self) -> Iterator[PlaceModel]:
@@ -134,6 +140,11 @@ def whole(tensor: Any) -> Tensor:
     """The full tensor of a sharded one (collective); any other as it is."""
     full: Tensor = tensor.full_tensor() if hasattr(tensor, "full_tensor") else tensor
     return full
+
+
+def as_moment(value: Tensor) -> Tensor:
+    """An optimiser tensor with at least one dimension: in older checkpoints SALAD's dustbin has none."""
+    return value[None] if value.ndim == 0 else value
 
 
 def placed_like(value: Tensor, target: Any) -> Tensor:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from pipeline.common.errors import UsageError
 from pipeline.distributed import rank, world_size
 from pipeline.model.vpr import PlaceModel
-from pipeline.training.engines.base import BuildOptimizer, Engine
+from pipeline.training.engines.base import COUNTER, BuildOptimizer, Engine, as_moment
 
 BUCKET = 50_000_000  # numbers reduced or gathered at a time; DeepSpeed's "auto" needs a transformers config
 STAGES = (1, 2, 3)
@@ -87,8 +87,7 @@ class ZeroEngine(Engine):
         optimizer: dict[str, Tensor] = {}
         for name, parameter in self.names().items():
             for key, value in held.items():
-                single = not isinstance(value, Tensor) or value.ndim == 0  # the step counter
-                whole = value if single else safe_get_full_optimizer_state(parameter, key)
+                whole = value if key == COUNTER else safe_get_full_optimizer_state(parameter, key)
                 if rank() == 0:
                     whole = whole if isinstance(whole, Tensor) else torch.tensor(float(whole))
                     optimizer[f"{name}/{key}"] = whole.detach().cpu().clone()
@@ -98,20 +97,20 @@ class ZeroEngine(Engine):
         if not optimizer:
             return
         parameters = self.names()
-        single = {key.rsplit("/", 1)[1]: value for key, value in optimizer.items() if value.ndim == 0}
-        moments = sorted({key.rsplit("/", 1)[1] for key, value in optimizer.items() if value.ndim > 0})
+        states = {key.rsplit("/", 1)[1]: value for key, value in optimizer.items()}
+        counter = states.pop(COUNTER, None)
         for flat in self._flat():
-            empty = {key: torch.zeros_like(flat) for key in moments}
-            self.optimizer.state[flat] = {**{key: value.clone() for key, value in single.items()}, **empty}
+            counted = {} if counter is None else {COUNTER: counter.clone()}
+            self.optimizer.state[flat] = {**counted, **{key: torch.zeros_like(flat) for key in sorted(states)}}
         if self.stage < 3:
             from deepspeed.utils import lazy_init_hp_params_optimizer_state
 
             for group, flat in zip(self._zero.bit16_groups, self._flat(), strict=True):
                 lazy_init_hp_params_optimizer_state(group, flat, self.optimizer.state)
         for key, value in optimizer.items():
-            name, moment = key.rsplit("/", 1)
-            if value.ndim > 0 or moment in moments:
-                self._put(parameters[name], value.float(), moment)
+            name, state = key.rsplit("/", 1)
+            if state != COUNTER:
+                self._put(parameters[name], as_moment(value).float(), state)
 
     def _put(self, parameter: nn.Parameter, value: Tensor, key: str) -> None:
         """This rank's part of a whole optimiser tensor into its partition."""

@@ -18,6 +18,7 @@ from pipeline.model.aggregators.netvlad import NetVLAD, k_means
 from pipeline.model.aggregators.salad import transport
 from pipeline.model.variants import BASELINES, PAPER, variant
 from pipeline.model.vpr import build_model, parameter_counts
+from pipeline.model.weights.names import fit
 
 DIM, GRID = 12, 5
 TINY = PoolingConfig(
@@ -138,6 +139,22 @@ TRUTHS = {"netvlad": netvlad, "cosplace": cosplace, "mixvpr": mixvpr, "salad": s
 
 def test_every_aggregator_has_a_truth() -> None:
     assert set(TRUTHS) == set(AGGREGATORS)
+
+
+@pytest.mark.parametrize("kind", [*TRUTHS, "spm", "gem"])
+def test_no_parameter_is_a_single_number(kind: str) -> None:
+    """FSDP2 shards along the first dimension and refuses a parameter that has none."""
+    assert all(parameter.ndim > 0 for parameter in built(kind).parameters())
+
+
+def test_a_dustbin_stored_as_a_number_is_read() -> None:
+    """As the release has it, and files of ours before it became a vector of one."""
+    module = built("salad")
+    older = {n: t.squeeze() if n == "dust_bin" else t for n, t in module.state_dict().items()}
+    assert older["dust_bin"].ndim == 0
+    other = build_pooling(dataclasses.replace(TINY, kind="salad"), DIM, GRID).double()
+    fit(other, older, "an older file")
+    assert torch.equal(other.dust_bin.detach(), module.dust_bin.detach())  # type: ignore[union-attr, operator]
 
 
 @pytest.mark.parametrize("kind", TRUTHS)

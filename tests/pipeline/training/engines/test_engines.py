@@ -20,6 +20,7 @@ from pipeline.benchmark.engines import compare
 from pipeline.common.errors import UsageError
 from pipeline.config import TrainConfig
 from pipeline.model.weights.files import load_model
+from pipeline.training.engines.base import Engine
 from pipeline.training.engines.build import choose
 from pipeline.training.engines.zero import zero_settings
 
@@ -134,6 +135,37 @@ def test_a_run_goes_from_engine_to_engine(root: Path, reference: Path) -> None:
     run("fsdp2", 2, path).kill_when(lambda: logged(folder, 7))
     run("ddp", 1, path).done()
     same_run(folder, reference)
+
+
+class Unwrapped:
+    """What `Engine` asks of an Accelerator on one process."""
+
+    scaler = None
+
+    def prepare(self, *given: Any) -> Any:
+        return given
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (3, 2)])
+@pytest.mark.parametrize("fused", [False, True])
+def test_moments_come_back_beside_their_parameter(shape: tuple[int, ...], fused: bool) -> None:
+    """The meta device stands for a GPU. What is a step counter follows from its name, not from its shape: the moments
+    of a parameter of one number were taken for counters and stayed on the CPU. A vector of one is also read from a
+    checkpoint in which it was a number."""
+    model: Any = torch.nn.ParameterDict({"weight": torch.nn.Parameter(torch.zeros(shape, device="meta"))})
+
+    def build(parameters: Any) -> torch.optim.Optimizer:
+        optimizer = torch.optim.Adam(parameters)
+        optimizer.param_groups[0]["fused"] = fused
+        return optimizer
+
+    engine = Engine(Unwrapped(), model, build, None)
+    stored = torch.zeros(() if shape == (1,) else shape)
+    engine.load({"weight/step": torch.tensor(7.0), "weight/exp_avg": stored, "weight/exp_avg_sq": stored}, {})
+    state = engine.optimizer.state[model["weight"]]
+    assert state["step"].device.type == ("meta" if fused else "cpu") and state["step"].ndim == 0
+    for name in ("exp_avg", "exp_avg_sq"):
+        assert (state[name].device.type, state[name].shape) == ("meta", model["weight"].shape)
 
 
 REFUSED = [

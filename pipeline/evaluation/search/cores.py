@@ -1,0 +1,36 @@
+"""How many cores the search and the PCA on rank 0 compute on.
+
+Launchers set OMP_NUM_THREADS to 1 for every rank they start, whatever the machine has. While rank 0 searches, the other
+ranks wait for it, so it may take all cores.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+
+@contextmanager
+def all_cores(faiss: bool = False) -> Iterator[None]:
+    """Within it torch (and `faiss`) compute on every core that this process may use, if a launcher started it as one of
+    several; otherwise, the user's own OMP_NUM_THREADS counts."""
+    if int(os.environ.get("LOCAL_WORLD_SIZE", "1")) == 1:
+        yield
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    before = torch.get_num_threads()
+    torch.set_num_threads(cores)
+    if faiss:  # it brings an OpenMP of its own
+        import faiss as library
+
+        before_faiss = library.omp_get_max_threads()
+        library.omp_set_num_threads(cores)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        if faiss:
+            library.omp_set_num_threads(before_faiss)
