@@ -111,9 +111,7 @@ class Engine:
             if state == COUNTER:  # torch keeps it on the CPU, and beside the parameter where the update is fused
                 inner.state[parameter][state] = value.to(parameter.device if fused else "cpu", copy=True)
             else:
-                inner.state[parameter][state] = placed_like(
-                    value if parameter.ndim == 0 else as_moment(value), parameter
-                )
+                inner.state[parameter][state] = placed_like(value, parameter)
 
     @contextmanager
     def plain(self) -> Iterator[PlaceModel]:
@@ -142,14 +140,11 @@ def whole(tensor: Any) -> Tensor:
     return full
 
 
-def as_moment(value: Tensor) -> Tensor:
-    """An optimiser tensor with at least one dimension: in older checkpoints SALAD's dustbin has none."""
-    return value[None] if value.ndim == 0 else value
-
-
 def placed_like(value: Tensor, target: Any) -> Tensor:
     """`value` placed as `target` is: device, dtype, and its shard where the target is sharded."""
     value = value.to(device=target.device, dtype=target.dtype)
+    if value.ndim == 0 and target.ndim == 1:  # older checkpoints hold SALAD's dustbin as a single number
+        value = value[None]
     if hasattr(target, "full_tensor"):
         from torch.distributed.tensor import distribute_tensor
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from pipeline.common.errors import UsageError
 from pipeline.distributed import rank, world_size
 from pipeline.model.vpr import PlaceModel
-from pipeline.training.engines.base import COUNTER, BuildOptimizer, Engine, as_moment
+from pipeline.training.engines.base import COUNTER, BuildOptimizer, Engine
 
 BUCKET = 50_000_000  # numbers reduced or gathered at a time; DeepSpeed's "auto" needs a transformers config
 STAGES = (1, 2, 3)
@@ -110,7 +110,7 @@ class ZeroEngine(Engine):
         for key, value in optimizer.items():
             name, state = key.rsplit("/", 1)
             if state != COUNTER:
-                self._put(parameters[name], as_moment(value).float(), state)
+                self._put(parameters[name], value.float().reshape(value.shape or (1,)), state)
 
     def _put(self, parameter: nn.Parameter, value: Tensor, key: str) -> None:
         """This rank's part of a whole optimiser tensor into its partition."""
