@@ -160,13 +160,22 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (world / "my" / "photos").mkdir(parents=True)
     for number in range(6):
         photo(number, 0).save(world / "my" / "photos" / f"{number}.jpg")
+    rows = ["image,role,positives"]
+    for place in range(6):
+        (world / "my" / "places" / f"place-{place}").mkdir(parents=True)
+        for view in range(5):
+            photo(place, view).save(world / "my" / "places" / f"place-{place}" / f"{view}.jpg")
+        rows.append(f"places/place-{place}/0.jpg,database,")
+        rows.append(f"places/place-{place}/4.jpg,query,places/place-{place}/0.jpg")
+    (world / "my" / "check.csv").write_text("\n".join(rows) + "\n")
     for name in ("query.jpg", "A.jpg", "B.jpg"):
         photo(2, 1).save(world / name)
     before = Path.cwd()
     os.chdir(world)
     try:
         run(["jobs.prepare", "--source", "data/gsv-cities", "--out", "data/shards", "--rounds", "2"], world)
-        (world / "data" / "city_shards").symlink_to(world / "data" / "shards")
+        for name in ("city_shards", "own_shards"):
+            (world / "data" / name).symlink_to(world / "data" / "shards")
         run(["jobs.train", "--config", "jobs/configs/cricavpr.yaml"], world)
         run(["jobs.train", "--config", "jobs/configs/cricavpr.yaml", "--name", "no-encoder"], world)
         run(
@@ -176,6 +185,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )  # fmt: skip
     finally:
         os.chdir(before)
+    (world / "outputs" / "own-photos").symlink_to(world / "launched" / "own-photos")  # its page trains it
     (world / "weights").mkdir()
     shutil.copy(
         (world / "outputs/cricavpr/checkpoints/best/model.safetensors").resolve(),
