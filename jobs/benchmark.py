@@ -4,8 +4,8 @@
     python -m jobs.benchmark step --size vitb --full  the paper's model, more rounds, torch.compile
     python -m jobs.benchmark cost --config jobs/configs/cricavpr.yaml
 
-Times are compared within one run, way against way in turn, because machines differ and are busy. Nothing here needs
-data or weights; what is measured is made.
+Alternatives are timed in turn within one run, because machines differ and are busy. No data or weights are needed: the
+inputs are generated.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Memory:
     size: Name = "demo"
     """Model and images, as in `step`."""
     limit_gb: float = 6.0
-    """Steps whose counted peak stays below (in 10^9 bytes) are also run, in fresh processes, on the CPU."""
+    """Steps with a counted peak below this (in 10^9 bytes) are also run on the CPU, each in its own process."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Data:
     """Times of reading images: decoding, augmentation, shards against plain files, the loader's workers."""
 
     size: Name = "demo"
-    """Whose image size is made."""
+    """Model whose image size is used."""
     full: bool = False
     """More rounds and images."""
 
@@ -88,7 +88,7 @@ class Engines:
     """
 
     engines: tuple[str, ...] = ("ddp", "fsdp2", "zero1", "zero2", "zero3")
-    """Names of files in jobs/accelerate."""
+    """Engines: names of files in jobs/accelerate."""
     processes: int = 2
     """Ranks of each launch."""
     trainable: Literal["adapters", "full", "frozen", "last"] = "full"
@@ -130,13 +130,13 @@ class Search:
     rows: int = 100_000
     """Database descriptors."""
     dim: int = 256
-    """Numbers a descriptor."""
+    """Dimensions of a descriptor."""
     queries: int = 1_000
-    """Queries; of a store all of its own."""
+    """Queries; with --store all stored queries."""
     recalls: tuple[int, ...] = (1, 10)
-    """Neighbours looked at: percent of the exact ones that were also found."""
+    """Nearest neighbours N: the result is the percentage of the exact N that were also found."""
     kinds: tuple[Literal["exact", "hnsw", "ivfpq"], ...] = ("exact", "hnsw", "ivfpq")
-    """What is measured."""
+    """Kinds of search to measure."""
     store: str | None = None
     """A folder of stored descriptors (it holds database/ and queries/) instead of made ones."""
     pca: int | None = None
@@ -144,9 +144,9 @@ class Search:
     sklearn: bool = False
     """Measure scikit-learn's PCA beside ours."""
     timeout: float = 600.0
-    """Seconds after which one measurement is given up, and said so."""
+    """Seconds after which one measurement is stopped; a line says so."""
     seed: int = 0
-    """Of the made descriptors."""
+    """Seed of the made descriptors."""
 
 
 @dataclass(frozen=True)
@@ -171,9 +171,9 @@ class Store:
     recall: int = 10
     """Neighbours searched."""
     folder: str | None = None
-    """Where the store is written and removed again; none: the temporary folder."""
+    """Folder in which the store is written, and removed at the end; none: the temporary folder."""
     timeout: float = 1800.0
-    """Seconds after which a step is given up, and said so."""
+    """Seconds after which a step is stopped; a line says so."""
 
 
 @dataclass(frozen=True)
@@ -187,9 +187,9 @@ class Mine:
     frames: str | None = None
     """Folder of GSV-Cities' `<City>.csv` or `.csv.gz`; its images are not needed."""
     places: int = 57_462
-    """How many places are made, without `frames`."""
+    """Number of made places, without `frames`."""
     dim: int = 256
-    """Numbers of a descriptor."""
+    """Dimensions of a descriptor."""
     places_per_batch: int = 72
     """Places of a batch."""
     clique: int = 6
@@ -201,7 +201,7 @@ class Mine:
     mine_temperature: float = 0.05
     """As data.mine_temperature."""
     seed: int = 0
-    """Of the made descriptors and of the plan."""
+    """Seed of the made descriptors and of the plan."""
 
 
 def main() -> None:

@@ -3,10 +3,9 @@
     python -m jobs.compare --runs first,second,third
     python -m jobs.compare --evaluations outputs/RUN/evaluation,elsewhere/evaluation --pairs all
 
-Runs that jobs.evaluate has predictions of are compared query by query with the first of them, or each with each: the
+Runs that jobs.evaluate has evaluated are compared query by query with the first of them, or each with each: the
 difference in recall with its 95 % interval (paired bootstrap), called real only where McNemar's exact test agrees.
-Folders of evaluations, also of stored descriptors or of a released model, are compared in this way alone, without
-MLflow.
+--evaluations compares folders of evaluations (also of stored descriptors or of a released model) without MLflow.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ class CompareJob:
     uri: str | None = None
     """Tracking server or store; none: MLFLOW_TRACKING_URI, else `<output>/mlflow.db`."""
     figures_also: tuple[Literal["pdf", "svg", "png"], ...] = ()
-    """The curves in these formats as well, for a paper: pdf and svg hold vectors, png has 300 dpi."""
+    """Write the curves in these formats as well: pdf and svg (vectors), png (300 dpi)."""
     output: str = "outputs"
     """Folder of the runs; the table (markdown, CSV) and the curves go to `<output>/comparison`."""
 

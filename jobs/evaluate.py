@@ -1,4 +1,4 @@
-"""Recall of a checkpoint with its protocol, on every set that is there, in all three groupings.
+"""Recall of a checkpoint, with its protocol: on the given sets or all that are found, in three groupings.
 
     python -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k,msls_val --root data
     accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k
@@ -7,8 +7,8 @@
 Prints one table and writes results.json, results.md, results.csv, predictions/, figures/ and report.html. The number of
 processes changes nothing but the time. Sets that are missing are named and left out; exit code 3 when none is there.
 
---from_store needs no model, no GPU, and opens no photo: every grouping that an evaluation with --store kept is scored
-again, whole and with each of --dimensions. The sets lie where they lay, since they tell what is correct.
+--from_store needs no model and no GPU, and opens no photo: every grouping that an evaluation with --store wrote is
+scored again, with all dimensions and with each of --dimensions. The sets must still be in their folders.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ class EvaluateJob(EvaluationConfig):
     figures: bool = True
     """Draw figures and the HTML report."""
     figures_also: tuple[Literal["pdf", "svg", "png"], ...] = ()
-    """Every figure in these formats as well, for a paper: pdf and svg hold vectors, photos and png have 300 dpi."""
+    """Write every figure in these formats as well: pdf and svg (vectors, photos at 300 dpi), png (300 dpi)."""
     timeout: float = 1800.0
     """Seconds that a process waits for the others."""
     from_store: str | None = None
     """Score stored descriptors instead of a checkpoint: the folder that an evaluation with --store wrote to."""
     dimensions: tuple[int, ...] = ()
-    """from_store: PCA dimensions, a row each beside the whole descriptors; fitted on each set's own database."""
+    """from_store: PCA dimensions, a row for each; PCA is fitted on each set's own database."""
 
 
 # what a store's descriptors leave open; all other settings of an evaluation were decided when they were made

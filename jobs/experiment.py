@@ -1,10 +1,11 @@
-"""Fill a table of the paper, row by row: trains and evaluates what is missing, puts the paper's figures beside ours.
+"""Fill a table of the paper: train and evaluate what is missing, and show the paper's figures beside ours.
 
     python -m jobs.experiment --table ablation_crica --config jobs/configs/paper.yaml --root data --seeds 0,1,2
     python -m jobs.experiment --table kernels --config jobs/configs/paper.yaml --dry_run
     python -m jobs.experiment --table spm --launch "accelerate launch --config_file jobs/accelerate/ddp.yaml"
 
-The configuration gives sizes and data, the table's rows change what the paper's table says. Killed, it continues.
+The configuration gives sizes and data; each row changes the settings that the paper's table varies. The same command
+continues a killed run.
 Writes `<output>/tables/<table>/table.{md,csv,png}`.
 """
 
@@ -28,13 +29,13 @@ class ExperimentJob(RunConfig):
     """ablation_crica, ablation_adaptation, dimensions, epochs, encoder_layers, train_batch, inference_batch, kernels,
     spm, same_data, or parts, mined, one_photo (ours; the last with paired intervals between rows)."""
     seeds: tuple[int, ...] = (0,)
-    """A training of every row with each seed, as `0,1,2`: mean and standard deviation are shown."""
+    """Train every row with each seed, as `0,1,2`; the table shows mean and standard deviation."""
     sets: tuple[str, ...] = ()
     """Evaluation sets, names or paths; none: those of the paper's table. Missing ones are named and left out."""
     root: str = "data"
     """Folder under which set names are looked up."""
     evaluate: EvaluationConfig = field(default_factory=lambda: EvaluationConfig(recalls=(1, 5, 10), resize="published"))
-    """How rows are evaluated, where the row does not say; `sets` and `root` are the options above."""
+    """Evaluation settings that a row does not set itself; `sets` and `root` are the options above."""
     launch: str = ""
     """Launcher of trainings and evaluations, such as 'accelerate launch --config_file jobs/accelerate/ddp.yaml'; empty:
     one plain process."""
@@ -43,9 +44,9 @@ class ExperimentJob(RunConfig):
     resnet_weights: str | None = None
     """same_data: ImageNet weights of ResNet-50 for NetVLAD, CosPlace, GeM and MixVPR; none: random weights."""
     images_per_second: float | None = None
-    """Measured training speed, for the estimate of --dry_run; none: what recorded runs of the same rows reached."""
+    """Training speed, for the time estimate of --dry_run; none: the speed of recorded runs of the same rows."""
     dry_run: bool = False
-    """Say which rows, trainings and sets there are, what they cost and what is missing; do nothing."""
+    """Only print rows, trainings, sets, their cost and what is missing."""
     measure: str = ""
     """Internal: a file with the evaluations of one run, which this process carries out."""
 

@@ -1,4 +1,4 @@
-"""The paper's figures, from one's own models.
+"""Draw the paper's figures from your own models.
 
     python -m jobs.figures --kind parameters --to figures/parameters.md
     python -m jobs.figures --kind attention --checkpoint outputs/RUN --photos a.jpg,b.jpg --to figures/attention.jpg
@@ -6,8 +6,9 @@
     python -m jobs.figures --kind qualitative --checkpoint outputs/RUN --baseline outputs/OTHER --sets pitts30k \
         --to figures/retrieval.jpg
 
-attention: channel means of the patch tokens, backbone as released and adapted. tsne: 36 places of 12 photos, the
-features before adaptation, after it, and of the complete model. qualitative: first answers where two models differ.
+attention: channel means of the patch tokens, of the released and the adapted backbone. tsne: 36 places of 12 photos,
+the features before adaptation, after it, and of the complete model. qualitative: the first answers of two models to
+queries where they differ.
 parameters: Total, Backbone, Adapter, Others and Tunable of every variant.
 """
 
@@ -34,14 +35,14 @@ class FiguresJob(EvaluationConfig):
     """File to write: .png or .jpg at 110 dpi, .pdf or .svg for a paper (vectors, photos at 300 dpi); .md for the
     parameters."""
     groups: tuple[Literal["single", "shuffled", "ordered"], ...] = ("shuffled",)
-    """How images share the cross-image encoder; the first counts."""
+    """Which images are described together; only the first value counts."""
     checkpoint: str = ""
     """Our model: a run or checkpoint folder, a file, or a released .pth."""
     baseline: tuple[str, ...] = ()
-    """What it is compared with: models as for --checkpoint; attention and tsne also take a backbone's weights, and
-    take the checkpoint's own backbone without its adapters where none is given."""
+    """Models to compare with, as for --checkpoint; attention and tsne also take a backbone's weights, and without
+    --baseline use the checkpoint's own backbone without its adapters."""
     photos: tuple[str, ...] = ()
-    """attention: photos, or folders of which six are taken evenly."""
+    """attention: photos, or folders; of a folder six photos at even distances."""
     places_from: str = ""
     """tsne: a folder in a layout that jobs.prepare reads: GSV-Cities', or a folder a place."""
     places: int = 36
@@ -49,9 +50,9 @@ class FiguresJob(EvaluationConfig):
     images: int = 12
     """tsne: photos of each place (paper: 12)."""
     perplexity: float = 30.0
-    """tsne: about how many neighbours count; at most a third of the photos."""
+    """tsne: the perplexity, about the number of neighbours that count; at most a third of the photos."""
     seed: int = 0
-    """tsne: draws the places and photos."""
+    """tsne: seed of the choice of places and photos."""
     count: int = 6
     """qualitative: rows."""
     variants: tuple[str, ...] = ()

@@ -26,16 +26,16 @@ class MineJob:
     checkpoint: str = ""
     """A run folder (its best checkpoint), a checkpoint folder, a .safetensors file, or a released .pth."""
     out: str = ""
-    """File to write, about 0.5 kB a place; an older one is replaced when the new one is complete."""
+    """File to write, about 0.5 kB per place; an older one is replaced when the new one is complete."""
     shards: tuple[str, ...] | str = "data/shards"
     """The shard set, or the list of sets, that will be trained on: the same ones in the same order."""
     kind: Literal["single", "bank", "permuted"] = "single"
     """single: each image alone; bank: beside the bank that was saved with the weights; permuted: single, shuffled among
     the places of each city, a control."""
     round: int = 0
-    """Which round of four images is described."""
+    """The round of four images that is described."""
     workers: int = 4
-    """Decoding processes a rank."""
+    """Decoding processes per rank."""
     cache: str = "data/cache"
     """Local folder for shards fetched from a URL."""
     timeout: float = 1800.0

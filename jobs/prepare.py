@@ -1,9 +1,10 @@
-"""Photos on disk -> tar shards with their index.
+"""Write photos on disk into tar shards with an index.
 
     python -m jobs.prepare --source DIR --out DIR --rounds 4
     python -m jobs.prepare --verify DIR
 
-Killed, it continues; done, it says so. Exit codes: 0 done, 2 usage, 3 too many bad images or a damaged set.
+The same command continues a killed run; after a finished run it says that nothing is to do. Exit codes: 0 done,
+2 usage, 3 too many bad images or a damaged set.
 """
 
 from __future__ import annotations
@@ -21,23 +22,23 @@ class PrepareConfig:
     """What to prepare, or to verify."""
 
     source: str | None = None
-    """Folder of GSV-Cities (Images/ and Dataframes/), Mapillary SLS (train_val/), @utm names, or one's own places."""
+    """Folder of GSV-Cities (Images/ and Dataframes/), Mapillary SLS (train_val/), @utm names, or your own places."""
     out: str | None = None
-    """Folder of the shard set; new, empty, or of the same set begun earlier."""
+    """Folder of the shard set: new, empty, or an unfinished set of the same source and settings."""
     rounds: int = 4
     """Rounds R, each with four images of every place; epoch e reads round e mod R. ceil(n/4) rounds show n images."""
     seed: int = 0
-    """Decides which images a round shows and the order of places."""
+    """Seed of the images of a round and of the order of places."""
     max_bad: float = 0.01
-    """Share of the named images that may be missing or broken before the run ends with code 3."""
+    """Largest share of missing or broken images; above it the run ends with code 3."""
     shard_mb: float = 64.0
-    """Size of a shard file in MB, about; smaller where a round would have under 16 of them."""
+    """Approximate size of a shard file in MB; smaller in a small set, so that a round has about 16 of them."""
     resize: int = 0
     """Reduce larger photos to this shorter side in pixels (JPEG quality 95); 0 copies the bytes."""
     check: Literal["decode", "header", "none"] = "decode"
     """How each JPEG is checked: decoded to its end, header and end marker only, or not at all."""
     kind: Literal["auto", "gsv_cities", "msls", "folders", "utm"] = "auto"
-    """Layout of the source: found by itself, GSV-Cities, Mapillary SLS, one folder a place, or @utm names in cells."""
+    """Layout of the source: auto recognises it; GSV-Cities, Mapillary SLS, a folder per place, or @utm names in cells."""
     cities: tuple[str, ...] = ()
     """gsv_cities, msls: cities to keep, for example '[PRS,Osaka]'; none keeps all (msls: all but cph and sf)."""
     cell_m: float | None = None
@@ -45,11 +46,11 @@ class PrepareConfig:
     heading_deg: float | None = None
     """utm, msls: width of a place's sector of headings in degrees; 30 (utm) or 60 (msls) where not given; 0: all."""
     workers: int = 0
-    """Processes; 0 is one a core, where there is work for it. The bytes do not depend on it."""
+    """Processes; 0: one per core, if there is work for it. The shards' bytes do not depend on it."""
     overwrite: bool = False
     """Delete the shard set in --out first."""
     verify: str | None = None
-    """Check every byte of a shard set (folder or fsspec URL) instead; code 3 when anything is off."""
+    """Check every byte of a shard set (folder or fsspec URL) instead; code 3 if anything is wrong."""
 
 
 def main() -> None:

@@ -1,8 +1,9 @@
 """Train one run, or continue it: accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.train --config FILE
 
 Also runs without the launcher, in one process: `python -m jobs.train --config FILE --data.places_per_batch 16`.
-The same command continues a run that was killed. `--dry_run` prints the plan and exits. Exit codes: `common.errors`;
-note that `accelerate launch` itself turns any of them but 0 into 1, so `<run>/status.json` tells them too.
+The same command continues a run that was killed. `--dry_run` prints the plan and exits. Exit codes: 0 done, 2 usage
+or configuration, 3 data, 4 diverged, 75 preempted and saved, 130 interrupted. `accelerate launch` turns every code
+but 0 into 1; `<run>/status.json` has the true one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Weights in and out: says what a file is, imports released weights, writes files that stand alone.
+"""Identify a weights file, import released weights, export a model to one file.
 
     python -m jobs.weights --source dinov2_vitb14_pretrain.pth --to weights/dinov2_vitb14.safetensors
     python -m jobs.weights --source CricaVPR.pth --to weights/cricavpr.safetensors
@@ -7,8 +7,8 @@
     python -m jobs.weights --source outputs/RUN --to weights/mine.onnx
 
 The ending of --to decides what is written: .safetensors (everything, with the config inside), .pth (published names,
-tensors alone), .onnx (the per-image path, checked by onnxruntime against torch). Without --to it only tells what the
-source is. Pickles are read as tensors alone; foreign code is never run.
+tensors only), .onnx (the per-image path, checked by onnxruntime against torch). Without --to it only says what the
+source is. Of pickles only tensors are read; no code in a file is ever run.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class WeightsJob:
     """A run or checkpoint folder, a file of ours, a released CricaVPR or DINOv2 .pth, a release of another method
     (CosPlace, EigenPlaces, MixVPR, SALAD, BoQ, NetVLAD, SFRS, GCL), a transformers folder or hub name."""
     to: str = ""
-    """The file to write: .safetensors, .pth or .onnx; none: only tell what the source is."""
+    """The file to write: .safetensors, .pth or .onnx; none: only say what the source is."""
     kind: Literal[
         "auto", "model", "cricavpr", "backbone",
         "cosplace", "mixvpr", "salad", "boq", "netvlad", "sfrs", "gcl", "gcl_avg", "gem",
@@ -44,14 +44,14 @@ class WeightsJob:
     """What the source must be; auto looks. cosplace is EigenPlaces too; gcl_avg must be said, its average pooling
     leaves no trace in the file."""
     image_size: int | None = None
-    """Side of the input in pixels; none: what the file says, for released weights the method's own (CricaVPR: 224)."""
+    """Side of the input in pixels; none: as the file says; for released weights the method's own (CricaVPR: 224)."""
     variant: str = ""
-    """For a backbone: write the whole model of the paper's variant around it, untrained."""
+    """For a backbone: write the whole model of this variant of the paper, with the rest untrained."""
     onnx: Literal["descriptors", "single", "regions"] = "descriptors"
-    """.onnx: descriptors, each image beside the bank where the source has one, else as its own group; single: as its
-    own group in any case; or the regional features before the cross-image encoder."""
+    """.onnx. descriptors: each image beside the bank if the source has one, else as its own group; single: always as its
+    own group; regions: the regional features before the cross-image encoder."""
     model: ModelConfig = field(default_factory=ModelConfig)
-    """Sizes where a released CricaVPR or backbone is not the paper's; other methods' releases tell their own."""
+    """Sizes of a released CricaVPR or backbone that is not the paper's; other releases state their own."""
 
 
 def main() -> None:

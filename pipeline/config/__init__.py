@@ -46,45 +46,44 @@ class DataConfig(Settings):
     shards: tuple[str, ...] | str = setting("data/shards", changes="numbers", resume="free")
     """Folder, or any fsspec URL, of a shard set made by jobs.prepare; or a list, `[a, b]`: one training over all."""
     shard_weights: tuple[float, ...] = setting((), changes="numbers", above=0, at_most=100, may_be_empty=True)
-    """How often a place of each set comes in an epoch, above 0: 0.5 half of the places, 2 each twice (never in one
-    batch); empty: 1 for each set."""
+    """How often a place of each set comes in an epoch: 0.5 uses half of the places, 2 uses each place twice (in
+    different batches); empty: 1 for each set."""
     places_per_batch: int = setting(72, changes="numbers", at_least=1)
     """Places in the global batch, over all ranks; four images each (paper: 72, so 288 images)."""
     order: Literal["city", "mixed", "blocked", "mined"] = setting("city", changes="numbers")
-    """Order of places: in-city batches (as published in effect), mixed over cities, within windows of shards, or
-    in-city batches of places that look alike to the model (mined; the first epoch is as city)."""
+    """Order of places. city: each batch from one city (as published in effect); mixed: over all cities; blocked: within
+    windows of shards; mined: as city, from places that look alike to the model (the first epoch is as city)."""
     mine_from: str = setting("single", changes="numbers")
-    """mined: what tells that places look alike. single: each image alone, by the model being trained; bank: beside its
-    bank; permuted: single, shuffled among the places of each city, a control without hardness; or a file of jobs.mine.
-    """
+    """mined: whose descriptors find places that look alike. single: the trained model's, each image alone; bank: beside
+    its bank; permuted: single, shuffled among the places of each city (the control); or a file of jobs.mine."""
     mine_every: int = setting(1, changes="numbers", at_least=1)
     """mined: epochs between two minings, the first before the second epoch. Not used with a file."""
     clique: int = setting(6, changes="numbers", at_least=2)
-    """mined: places that are grouped because they look alike; a batch is made of such groups."""
+    """mined: places in a group of places that look alike; a batch is made of such groups."""
     mine_neighbours: int = setting(64, changes="numbers", at_least=1, at_most=1024)
-    """mined: most similar places of the same city that a group is drawn from."""
+    """mined: a group is drawn from this many most similar places of the same city."""
     mine_radius: float = setting(25.0, changes="numbers", at_least=0)
     """mined: no two places of a group lie closer than this, in metres; 0: positions are not used."""
     mine_temperature: float = setting(0.05, changes="numbers", at_least=0, at_most=1000)
-    """mined: randomness of the draw, in units of cosine similarity; 0 takes the most similar ones."""
+    """mined: randomness of the draw, in units of cosine similarity; 0 draws the most similar places."""
     window_shards: int = setting(8, changes="numbers", at_least=1)
     """Shards read together by order=blocked."""
     image_size: int = setting(224, changes="numbers", at_least=1, at_most=8192)
     """Side of the square input, in pixels; a multiple of the patch size (paper: 224)."""
     augment: Literal["rand", "light", "off"] = setting("rand", changes="numbers")
-    """RandAugment as published; a light colour jitter and crop; or nothing."""
+    """rand: RandAugment as published; light: small changes of colour and crop; off: nothing."""
     rand_ops: int = setting(3, changes="numbers", at_least=0, at_most=16)
-    """RandAugment: operations an image (paper: 3)."""
+    """RandAugment: operations per image (paper: 3)."""
     rand_magnitude: int = setting(9, changes="numbers", at_least=0, at_most=30)
     """RandAugment: magnitude out of 30 (published: 9)."""
     workers: int = setting(4, changes="speed", at_least=0, at_most=MANY)
-    """Decoding processes a rank; 0 decodes in the training process."""
+    """Decoding processes per rank; 0 decodes in the training process."""
     prefetch: int = setting(2, changes="speed", at_least=1, at_most=MANY)
     """Batches each worker prepares ahead."""
     cache: str = setting("data/cache", changes="none")
     """Local folder for shards fetched from a URL."""
     cache_gb: float = setting(50.0, changes="speed", above=0)
-    """Bound of that cache in GB (10^9 bytes)."""
+    """Largest size of that cache in GB (10^9 bytes)."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,7 @@ class LossConfig(Settings):
 
 @dataclass(frozen=True)
 class EvaluationConfig(Settings):
-    """Which sets are searched, under which protocols. A recall means nothing without these."""
+    """Which sets are evaluated, under which protocols."""
 
     sets: tuple[str, ...] = setting((), changes="numbers", may_be_empty=True)
     """Folders of evaluation sets, `<dataset>/images/<split>/{database,queries}`, or a set's name under `root`."""
@@ -116,47 +115,47 @@ class EvaluationConfig(Settings):
     groups: tuple[Literal["single", "shuffled", "ordered", "bank"], ...] = setting(
         ("single", "shuffled", "ordered"), changes="numbers"
     )
-    """Which images share an inference batch: each alone, seeded random groups, neighbours in file order (the paper's
-    way), or each image beside a fixed bank of images (ours; docs/one_photo.md)."""
+    """Images that are described together. single: each alone; shuffled: seeded random groups; ordered: neighbours in
+    file order (paper); bank: each beside a fixed bank of images (ours; docs/one_photo.md)."""
     group_size: int = setting(16, changes="numbers", at_least=1)
-    """Images a group for shuffled and ordered (paper: 16; 8 on Pittsburgh)."""
+    """Images per group for shuffled and ordered (paper: 16; 8 on Pittsburgh)."""
     group_seed: int = setting(0, changes="numbers", at_least=0, at_most=SEEDS)
     """Seed of the shuffled grouping."""
     bank: int = setting(64, changes="numbers", at_least=1, at_most=65_536)
-    """Images in the bank; all there are where they are fewer. Training saves a bank of so many beside its weights."""
+    """Largest number of images in the bank. Training saves a bank of this size beside its weights."""
     bank_from: str = setting("train", changes="numbers")
-    """Whose images: train (the bank saved beside the weights), map (drawn from each set's database), or a folder."""
+    """Images of the bank: train (saved beside the weights), map (drawn from each set's database), or a folder."""
     recalls: tuple[int, ...] = setting((1, 5, 10, 20), changes="numbers", at_least=1, at_most=10_000)
     """The N of Recall@N."""
     radius: float = setting(25.0, changes="numbers", at_least=0, at_most=100_000)
     """Metres within which a database image is a positive, inclusive (paper: 25)."""
     frames: int | None = setting(None, changes="numbers", at_least=0)
-    """For sequences without positions: positives are +- this many frames instead of metres."""
+    """Sequences without positions: database images within this many frames are positives."""
     without_positives: Literal["miss", "drop"] = setting("miss", changes="numbers")
-    """Queries that have no positive count as a miss, or are dropped (MSLS's own tool)."""
+    """Queries without a positive: count them as a miss, or drop them (as MSLS's own tool does)."""
     resize: Literal["antialias", "published"] = setting("antialias", changes="numbers")
     """antialias: resize as in training, then normalise; published: normalise, then resize without antialias."""
     pca: int | None = setting(None, changes="numbers", at_least=1)
     """Dimensions kept by PCA; none keeps all (paper: 4096)."""
     batch: int = setting(32, changes="speed", at_least=1, at_most=65_536)
-    """Images a forward pass of the per-image part; memory only, never the result."""
+    """Images per forward pass of the per-image part; changes memory, not the result."""
     workers: int = setting(4, changes="speed", at_least=0, at_most=MANY)
-    """Decoding processes a rank; 0 decodes in the evaluating process."""
+    """Decoding processes per rank; 0 decodes in the evaluating process."""
     precision: Literal["fp32", "bf16", "fp16"] = setting("fp32", changes="numbers")
     """Autocast of the per-image part; the cross-image encoder and the search stay in fp32."""
     store: Literal["none", "fp32", "fp16"] = setting("none", changes="numbers")
-    """Keep descriptors as Parquet under the output folder, in this type; they are reused when nothing changed."""
+    """Write descriptors as Parquet under the output folder, in this type; they are reused when nothing changed."""
     pca_from: str | None = setting(None, changes="numbers")
-    """Set whose database PCA is fitted on, at most 16,384 images (paper: Pitts30k train); none: each set's own."""
+    """PCA is fitted on this set's database, at most 16,384 images (paper: Pitts30k train); none: each set's own."""
     pca_whiten: bool = setting(False, changes="numbers")
-    """Scale PCA's directions to unit variance (published: no)."""
+    """Scale the PCA dimensions to unit variance (published: no)."""
     search: Literal["exact", "ivfpq", "hnsw"] = setting("exact", changes="numbers")
     """Exact L2 search, or a faiss approximation for large sets, whose recall against exact is measured and printed."""
     rerank: int = setting(0, changes="numbers", at_least=0, at_most=10_000)
-    """Second stage: this many first candidates are put in order by matching patch tokens in space; 0: none. Reads the
-    candidates' images again; not for validation during training."""
+    """Re-rank this many first candidates by matching patch tokens in space; 0: none. Reads their images again; not for
+    validation during training."""
     rerank_layer: int | None = setting(None, changes="numbers", at_least=1)
-    """Block (transformer) or stage (ResNet, VGG) of the backbone whose patches are matched, from 1; none: its last."""
+    """rerank: block (transformer) or stage (ResNet, VGG) whose patches are matched, from 1; none: the last."""
 
 
 @dataclass(frozen=True)
@@ -174,43 +173,43 @@ class TrainConfig(Settings):
     weight_decay: float = setting(0.0, changes="numbers", at_least=0)
     """Weight decay (published: 0)."""
     schedule: Literal["step", "cosine", "constant"] = setting("step", changes="numbers")
-    """step halves the rate every `step_epochs` (paper); cosine decays to 0; both stepped per iteration."""
+    """Learning rate. step: halved every `step_epochs` (paper); cosine: decays to 0; constant. Set at each step."""
     step_epochs: float = setting(3.0, changes="numbers", above=0)
     """schedule=step: epochs between two reductions (paper: 3)."""
     step_factor: float = setting(0.5, changes="numbers", above=0, at_most=1)
-    """schedule=step: factor of a reduction (paper: 0.5)."""
+    """schedule=step: factor of each reduction (paper: 0.5)."""
     warmup_steps: int = setting(0, changes="numbers", at_least=0)
     """Linear warm-up in steps (published: 0)."""
     max_grad_norm: float | None = setting(None, changes="numbers", above=0, formerly="clip")
     """Largest norm of the gradient; none: no clipping (published: none)."""
     passes: Literal["group", "joint"] = setting("group", changes="numbers")
-    """group: each image is described in the global batch (paper). joint (ours): from the same regions also alone, and
-    one loss is taken over both descriptions of all images, so that the weights also serve a single photo. The backbone
-    runs once; needs a cross-image encoder."""
+    """group: each image is described in the global batch (paper). joint (ours): also alone, with one loss over both
+    descriptions of all images, so that the weights also serve a single photo. The backbone runs once. joint needs a
+    cross-image encoder."""
     validate_first: bool = setting(True, changes="none")
     """Evaluate the untrained model before the first step, so that a run shows what training added."""
     patience: int = setting(3, changes="numbers", at_least=0, resume="free")
     """Stop after this many epochs without a better validation R@5 (paper: 3); 0 never stops early."""
     encode_chunk: int | None = setting(None, changes="speed", at_least=1)
-    """Images encoded at a time on a rank, recomputed in backward; none: all at once. Always exact. Memory then does not
-    grow with the batch for adapter.norm group or none; with batch it grows slower, as BatchNorm needs all images."""
+    """Images encoded at a time on a rank, recomputed in backward; none: all at once. Always exact. Memory of the
+    per-image part then does not grow with the batch for adapter.norm group or none; for batch it grows more slowly."""
     compile: bool = setting(False, changes="speed")
-    """torch.compile the backbone's blocks; for one process and DDP, without encode_chunk. Not used in validation."""
+    """Compile the backbone's blocks (torch.compile): one process or DDP, without encode_chunk; not in validation."""
     engine: Literal["auto", "ddp", "fsdp2"] = setting("auto", changes="speed")
-    """auto: what accelerate was launched with (DDP, DeepSpeed); fsdp2 shards parameters with fully_shard."""
+    """auto: the engine that accelerate was launched with (DDP, DeepSpeed); fsdp2 shards parameters (fully_shard)."""
     save_every: int = setting(200, changes="none", at_least=1)
     """Steps between two saves of the last checkpoint; also at each epoch's end and on SIGTERM or SIGUSR1."""
     keep: int = setting(2, changes="none", at_least=1)
-    """Step checkpoints kept beside the best one."""
+    """Number of step checkpoints that are kept beside the best one."""
     resume: str = setting("auto", changes="none")
-    """auto continues the run folder's last checkpoint where there is one; never starts anew (and refuses to
-    overwrite); or the path of a checkpoint."""
+    """auto: continue from the run folder's last checkpoint if it exists; never: start a new run (refused if one
+    exists); or the path of a checkpoint to start from."""
     log_every: int = setting(10, changes="none", at_least=1)
     """Steps between two progress lines and metric records."""
     timeout: float = setting(600.0, changes="none", above=0, at_most=MONTH)
     """Seconds a rank waits for the others in a collective before the job ends with an error."""
     log_samples: bool = setting(False, changes="none")
-    """Write the sample keys of each step to samples.rank<r>.jsonl, the proof that nothing is repeated or skipped."""
+    """Write the sample keys of each step to samples.rank<r>.jsonl; they show that nothing is repeated or skipped."""
 
 
 @dataclass(frozen=True)
@@ -247,7 +246,7 @@ class RunConfig(Settings):
         default_factory=lambda: EvaluationConfig(split="val", groups=("shuffled",)),
         metadata={"resume": "free"},  # no step depends on it
     )
-    """Evaluated after each epoch, best checkpoint chosen by R@5 of the first set and grouping; empty `sets`: none."""
+    """Evaluated after each epoch; R@5 of the first set and grouping chooses the best checkpoint. Empty `sets`: none."""
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     """Where runs are recorded."""
 

@@ -19,8 +19,8 @@ class ResNetConfig(Settings):
     """Last stage used: layer3 has stride 16 and 1024 channels (256 in ResNet-18 and 34), layer4 stride 32 and twice
     as many."""
     layout: Literal["torchvision", "keras"] = setting("torchvision", changes="numbers")
-    """Whose weights: keras puts a down-sampling bottleneck's stride in its first convolution, has BatchNorm eps
-    1.001e-5 and takes BGR 0..255 minus means (converted inside: the model's input stays the same)."""
+    """Origin of the weights. keras: the stride of a down-sampling bottleneck is in its first convolution, BatchNorm eps
+    is 1.001e-5, and the input is BGR 0..255 minus means (converted inside: the model's input stays the same)."""
     stages: tuple[int, ...] = setting((3, 4, 6, 3), changes="numbers", at_least=1, at_most=1000)
     """resnet_custom: bottlenecks of the four stages."""
     width: int = setting(64, changes="numbers", at_least=1, at_most=4096)
@@ -35,8 +35,8 @@ class VGGConfig(Settings):
     """conv5_3: the last convolution without its ReLU, stride 16 (NetVLAD, SFRS, CosPlace); pool5: ReLU and pooling
     too, stride 32 (GCL). Both have 512 channels."""
     layout: Literal["torchvision", "matconvnet"] = setting("torchvision", changes="numbers")
-    """Whose weights: matconvnet's, which SFRS starts from, take RGB 0..255 minus means (converted inside: the model's
-    input stays the same)."""
+    """Origin of the weights. matconvnet (SFRS starts from these): the input is RGB 0..255 minus means (converted
+    inside: the model's input stays the same)."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ class NetVLADConfig(Settings):
     clusters: int = setting(64, changes="numbers", at_least=1, at_most=4096)
     """Clusters K; the descriptor has K x D numbers (published: 64)."""
     samples: int = setting(50_000, changes="numbers", at_least=1, at_most=10_000_000)
-    """Patch features that k-means starts the centres from, before the first step (published: 50,000)."""
+    """Patch features that k-means clusters into the centres, before the first step (published: 50,000)."""
     per_image: int = setting(100, changes="numbers", at_least=1, at_most=100_000)
-    """Of them at most this many an image (published: 100)."""
+    """Patch features of one image among them, at most (published: 100)."""
     bias: bool = setting(False, changes="numbers")
-    """A bias in the assignment, which then is by distance to the centres, not by angle (`vladv2` in releases)."""
+    """Assign patches by distance to the centres (with a bias, `vladv2` in releases) instead of by angle."""
     projection: int = setting(0, changes="numbers", at_least=0, at_most=65_536)
-    """Dimensions of a linear layer behind the normalised residuals, the PCA with whitening of SFRS' release (4096); 0
-    leaves the residuals as they are. Not set from images."""
+    """Dimensions of a linear layer after the normalised residuals (SFRS' release: PCA with whitening, 4096); 0: none. It is
+    not initialised from images."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class MixVPRConfig(Settings):
     depth: int = setting(4, changes="numbers", at_least=0, at_most=100)
     """Mixer layers (published: 4)."""
     mlp_ratio: float = setting(1.0, changes="numbers", above=0, at_most=100)
-    """Hidden width of a mixer over the number of positions (published: 1)."""
+    """Hidden width of a mixer divided by the number of positions (published: 1)."""
 
 
 @dataclass(frozen=True)

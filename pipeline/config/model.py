@@ -46,7 +46,7 @@ class BackboneConfig(Settings):
     patch: int = setting(14, changes="numbers", at_least=1, at_most=1024)
     """custom: patch side in pixels."""
     mlp_ratio: int = setting(4, changes="numbers", at_least=1, at_most=16)
-    """custom: hidden width of the MLP over dim."""
+    """custom: hidden width of the MLP divided by dim."""
     layerscale: float = setting(1.0, changes="numbers")
     """custom: initial LayerScale; 1.0 suits training from scratch, 1e-5 is DINOv2's own start."""
     pretrain_grid: int = setting(37, changes="numbers", at_least=1, at_most=1024)
@@ -58,7 +58,7 @@ class BackboneConfig(Settings):
     attention: Literal["sdpa", "eager", "flash_attention_2", "flex_attention"] = setting("sdpa", changes="speed")
     """Attention implementation of transformers."""
     final_norm: bool = setting(True, changes="numbers")
-    """Transformers: the norm after the last block, which DINOv2's own tokens have; BoQ's release leaves it out."""
+    """Transformers: apply the norm after the last block, as DINOv2 does; BoQ's release does not."""
     resnet: ResNetConfig = field(default_factory=ResNetConfig)
     """Residual networks: the part used, the origin of the weights, sizes of resnet_custom."""
     vgg: VGGConfig = field(default_factory=VGGConfig)
@@ -74,7 +74,7 @@ class AdapterConfig(Settings):
     )
     """mulconv (paper); vanilla bottleneck; conv: 3x3 without skip (Convpass-like); single kernels with skip; none."""
     ratio: float = setting(0.5, changes="numbers", above=0, at_most=16)
-    """Bottleneck width over dim (paper: 0.5, so 384)."""
+    """Bottleneck width divided by dim (paper: 0.5, so 384)."""
     reduced: int = setting(24, changes="numbers", at_least=1, at_most=8192)
     """Channels after the 1x1 reduction of the 3x3 and 5x5 paths (paper: 24)."""
     scale: float = setting(0.2, changes="numbers")
@@ -82,8 +82,8 @@ class AdapterConfig(Settings):
     norm: Literal["batch", "group", "none"] = setting("batch", changes="numbers")
     """Normalisation in the convolution paths: global BatchNorm (published), GroupNorm (per image), or none."""
     init: Literal["kaiming", "published"] = setting("kaiming", changes="numbers")
-    """Convolution initialisation: Kaiming (ours), or the published constant 1e-5, which keeps reductions one channel
-    wide for ever."""
+    """Convolution initialisation: Kaiming (ours), or the published constant 1e-5, which keeps the channels of a
+    reduction identical during the whole training."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class CrossImageConfig(Settings):
     dropout: float = setting(0.1, changes="numbers", at_least=0, below=1)
     """Dropout in attention, feed-forward and residuals (published: 0.1)."""
     alone: bool = setting(False, changes="numbers")
-    """Each image attends to itself only, in training too: the layers without the crossing, a control (ours)."""
+    """Each image attends to itself only, in training too (ours): a control, the layers without other images."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +140,6 @@ class ModelConfig(Settings):
     cross_image: CrossImageConfig = field(default_factory=CrossImageConfig)
     """The cross-image encoder."""
     trainable: Literal["adapters", "full", "frozen", "last"] = setting("adapters", changes="numbers", formerly="train")
-    """What of the backbone is trained: its adapters (paper), all of it, nothing, or the last blocks."""
+    """Trained part of the backbone: its adapters (paper), all of it (full), nothing (frozen), or the last blocks."""
     last_blocks: int = setting(4, changes="numbers", at_least=1, at_most=100)
     """trainable=last: how many blocks (of a residual network: stages) at the end are trained."""
