@@ -38,7 +38,7 @@ class PrepareConfig:
     check: Literal["decode", "header", "none"] = "decode"
     """How each JPEG is checked: decoded to its end, header and end marker only, or not at all."""
     kind: Literal["auto", "gsv_cities", "msls", "folders", "utm"] = "auto"
-    """Layout of the source: auto recognises it; GSV-Cities, Mapillary SLS, a folder per place, or @utm names in cells."""
+    """Layout of the source: auto: recognised; GSV-Cities, Mapillary SLS, a folder per place, or @utm names in cells."""
     cities: tuple[str, ...] = ()
     """gsv_cities, msls: cities to keep, for example '[PRS,Osaka]'; none keeps all (msls: all but cph and sf)."""
     cell_m: float | None = None

@@ -48,8 +48,8 @@ class WeightsJob:
     variant: str = ""
     """For a backbone: write the whole model of this variant of the paper, with the rest untrained."""
     onnx: Literal["descriptors", "single", "regions"] = "descriptors"
-    """.onnx. descriptors: each image beside the bank if the source has one, else as its own group; single: always as its
-    own group; regions: the regional features before the cross-image encoder."""
+    """.onnx. descriptors: each image beside the bank if the source has one, else as its own group; single: always as
+    its own group; regions: the regional features before the cross-image encoder."""
     model: ModelConfig = field(default_factory=ModelConfig)
     """Sizes of a released CricaVPR or backbone that is not the paper's; other releases state their own."""
 

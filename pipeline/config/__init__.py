@@ -305,7 +305,7 @@ def nested(flat: Any) -> dict[str, Any]:
         for section in sections:
             inner = inner.setdefault(section, {})
             if not isinstance(inner, dict):
-                raise UsageError(f"{shortened(name)} stands beside a setting {shortened(section)}")
+                raise UsageError(f"{shortened(name)} cannot be set: {shortened(section)} is a setting, not a section")
         inner[last] = value
     return values
 

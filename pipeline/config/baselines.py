@@ -52,8 +52,8 @@ class NetVLADConfig(Settings):
     bias: bool = setting(False, changes="numbers")
     """Assign patches by distance to the centres (with a bias, `vladv2` in releases) instead of by angle."""
     projection: int = setting(0, changes="numbers", at_least=0, at_most=65_536)
-    """Dimensions of a linear layer after the normalised residuals (SFRS' release: PCA with whitening, 4096); 0: none. It is
-    not initialised from images."""
+    """Dimensions of a linear layer after the normalised residuals (SFRS' release: PCA with whitening, 4096); 0: none.
+    It is not initialised from images."""
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ class PlaceDescriptors:
         if len(wrong):
             raise DataError(
                 f"{len(wrong):,} of {len(lengths):,} places have no usable descriptor (the first is place {wrong[0]}, "
-                f"of length {lengths[wrong[0]]:g}): the model tells their images from no others, or gives no numbers"
+                f"of length {lengths[wrong[0]]:g}): the model gives all images one descriptor, or not finite values"
             )
 
     @property

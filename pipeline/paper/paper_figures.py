@@ -172,7 +172,7 @@ def retrieval_comparison(
     found = differences(evaluated, ours, baseline)
     both = len(found.ours) + len(found.baseline)
     if not both:
-        raise UsageError(f"{evaluated.name}: '{name}' and '{other}' are right and wrong on the same queries")
+        raise UsageError(f"{evaluated.name}: '{name}' and '{other}' are right on the same queries: nothing to draw")
     reverse = min(len(found.baseline), max(round(count * len(found.baseline) / both), int(len(found.baseline) > 0)))
     rows = [*_spread(found.ours, max(count - reverse, int(len(found.ours) > 0))), *_spread(found.baseline, reverse)]
     tile = (TILE, round(TILE / usual_aspect([evaluated.queries[q] for q in rows])))

@@ -90,7 +90,7 @@ def pretrained(model: torch.nn.Module) -> Iterator[None]:
     config: Any = model.config
     if config.trainable not in ("adapters", "frozen"):
         raise UsageError(
-            f"the model's backbone was trained itself (model.trainable {config.trainable}), so its "
+            f"the model's backbone was trained (model.trainable {config.trainable}), so its "
             "pre-trained state is not in it; give it as --baseline: released weights or another run"
         )
     adapted = [module for module in model.modules() if isinstance(module, AdaptedMLP)]

@@ -192,7 +192,7 @@ def find(run: Path, resume: str) -> Path | None:
             found = path.resolve()
             later = [p for p in (run / "checkpoints").glob("step-*") if p.name > found.name]
             if found.parent == (run / "checkpoints").resolve() and later:
-                raise UsageError(f"{run} has gone on past {found.name}; continue from it under another --name")
+                raise UsageError(f"{run} has checkpoints after {found.name}; continue from it under another --name")
             return found
     raise UsageError(f"{resume} holds no checkpoint (no state.json)")
 
@@ -236,7 +236,7 @@ def _told(path: Path) -> tuple[RunState, dict[str, Any]]:
     check(state)
     last = max(state.epoch, state.cursor, state.best_step or 0, state.validated_step or 0)
     if last > state.step:
-        raise DataError(f"state.json tells of step {state.step}, epoch {state.epoch}, batch {state.cursor} of it")
+        raise DataError(f"state.json cannot be right: step {state.step}, epoch {state.epoch}, batch {state.cursor}")
     return state, flatten(from_dict(RunConfig, nested(told["config"])))
 
 

@@ -38,8 +38,8 @@ def compile_backbone(model: PlaceModel, config: RunConfig, engine: str, device: 
         )
     if config.train.encode_chunk is not None:
         raise UsageError(
-            "train.compile does not go with train.encode_chunk: chunks recompute each block in backward, which "
-            "BatchNorm must notice and compiled code cannot; leave one of the two out"
+            "train.compile does not go with train.encode_chunk: chunks recompute each block in backward, and "
+            "compiled code cannot tell BatchNorm so; leave one of the two out"
         )
     _try_compiler(device)
     for block in model.backbone.blocks:

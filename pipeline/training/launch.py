@@ -192,7 +192,7 @@ def _check_launcher(running: int) -> None:
     if asked is not None and asked != running:
         raise UsageError(
             f"accelerate launch was asked for {asked} processes and started {running}: its config file, or the default "
-            f"one at home, says otherwise (distributed_type: NO?); {ADVICE}"
+            f"one in the home folder, sets another number (distributed_type: NO?); {ADVICE}"
         )
 
 

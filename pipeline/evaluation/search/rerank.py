@@ -88,7 +88,7 @@ class PatchTokens:
         self._kept: OrderedDict[Path, Tensor] = OrderedDict()
         patches = len(self._patches(torch.zeros(3, model.image_size, model.image_size)))
         if patches < SIDE * SIDE:
-            raise UsageError(f"rerank: {patches} patches an image are too few to check in space, 16 is the least")
+            raise UsageError(f"rerank: an image has {patches} patches and needs at least 16; use a larger image_size")
 
     def _patches(self, image: Tensor) -> Tensor:
         """[3, S, S] normalised -> [G*G, D]."""

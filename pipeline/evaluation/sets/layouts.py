@@ -150,8 +150,8 @@ def nordland(name: str, folder: Path, config: EvaluationConfig, frames: int, spa
         in_summer = in_summer[::10]
     if len(in_summer) != (len(in_winter) + 9) // 10:
         raise DataError(
-            f"{summer}: {len(in_summer):,} queries for {len(in_winter):,} database frames; the * protocol asks with "
-            "every tenth frame"
+            f"{summer}: {len(in_summer):,} queries for {len(in_winter):,} database frames; in the * protocol "
+            "every tenth frame is a query"
         )
     return by_frame(name, in_winter, in_summer, frames, stride=10)
 

@@ -49,7 +49,7 @@ def val(name: str, folder: Path, config: EvaluationConfig) -> EvaluationSet:
     keys = _official_keys([folder, folder.parent])
     if keys is None:
         raise DataError(
-            f"{base / 'queries'}: which of these are the 740 official queries cannot be told from their names; put "
+            f"{base / 'queries'}: file names do not tell the 740 official queries from the others; put "
             f"{QUERY_LISTS[0]}, a text file {QUERY_LISTS[1]} (a key or path a line) or Mapillary's "
             f"train_val/<city>/query/subtask_index.csv into {folder}"
         )

@@ -165,7 +165,7 @@ def write_backbone(source: str, config: BackboneConfig, path: Path) -> dict[str,
         save_file(tensors, partial, {"format": "pt", "backbone": config.name})
         again = _checked(str(partial), config)
         if any(not torch.equal(again[name], tensor) for name, tensor in tensors.items()):
-            raise DataError(f"{path}: reads back otherwise than written; is the disk sound?")
+            raise DataError(f"{path}: differs when it is read back; check the disk")
 
     _replaced(path, write)
     return tensors

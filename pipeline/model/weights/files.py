@@ -186,7 +186,7 @@ def checkpoint_file(path: str | Path) -> Path:
             folder = folder.parent / folder.read_text().strip()
         if (folder / FILE).is_file():
             return folder / FILE
-    raise UsageError(f"{given}: no model there (a .safetensors file, a checkpoint folder, or a run folder is wanted)")
+    raise UsageError(f"{given}: no model there (a .safetensors file, a checkpoint folder, or a run folder is needed)")
 
 
 def check_digest(file: Path) -> None:
@@ -239,7 +239,7 @@ def load_trainable(model: PlaceModel, path: str | Path) -> dict[str, Any]:
     wanted = saved_names(model, model.config, metadata["everything"])
     if len(wanted) < len(model.state_dict()) and metadata["backbone_hash"] != frozen_hash(model):
         raise UsageError(
-            f"{file}: trained beside other frozen weights (hash {metadata['backbone_hash']}, here "
+            f"{file}: trained with other frozen weights (hash {metadata['backbone_hash']}, here "
             f"{frozen_hash(model)}); give model.backbone.weights the file it was trained with"
         )
     fit(model, read_tensors(str(file)), str(file), wanted=wanted)

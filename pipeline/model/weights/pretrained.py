@@ -69,7 +69,7 @@ def _indexed(index: Path) -> list[str]:
         raise DataError(f"{index}: not an index of safetensors files ({message(error)})") from error
     for file in files:
         if not isinstance(file, str) or Path(file).name != file or not (index.parent / file).is_file():
-            raise DataError(f"{index}: '{shown(file)}' is no file beside it")
+            raise DataError(f"{index}: the file '{shown(file)}' is not beside it")
     return files
 
 
@@ -98,7 +98,7 @@ def _read_pickle(path: Path) -> dict[str, Tensor]:
             loaded = torch.load(stream, map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load has no closed list: zip, pickle, end of file, unsafe globals
         raise DataError(
-            f"{path}: not loaded, it is broken or holds more than tensors, and foreign code is never run "
+            f"{path}: not loaded: it is broken or holds more than tensors, and code in a file is never run "
             f"({message(error)})"
         ) from error
     if not isinstance(loaded, Mapping):

@@ -152,7 +152,7 @@ def _shaped(tensor: Tensor, shape: Iterable[int], name: str, source: str) -> Ten
     wanted, got = tuple(shape), tuple(tensor.shape)
     if got not in (wanted, (*wanted, 1, 1)) and (got, wanted) != ((), (1,)):
         raise UsageError(
-            f"{source}: '{name}' is {shape_text(got)}, where its other tensors want {shape_text(wanted)}; the file is "
+            f"{source}: '{name}' is {shape_text(got)}, but its other tensors need {shape_text(wanted)}; the file is "
             "of a variant that is not known here, or damaged"
         )
     return (tensor.float() if tensor.is_floating_point() else tensor).reshape(wanted)

@@ -199,7 +199,7 @@ def zero_settings(
     for what in ("optimizer", "param"):
         device = (zero.pop(f"offload_{what}", None) or {}).get("device", "none")
         if device != "none":
-            raise UsageError(f"engine zero: offload_{what}_device {device} is not supported; more ranks shard further")
+            raise UsageError(f"engine zero: offload_{what}_device {device} is not supported; use more ranks")
     settings: dict[str, Any] = {
         "train_micro_batch_size_per_gpu": micro_batch,
         "gradient_accumulation_steps": 1,

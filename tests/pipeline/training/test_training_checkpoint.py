@@ -80,7 +80,7 @@ def test_finding(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds no checkpoint"):
         checkpoint.find(run, str(tmp_path / "nowhere"))
     save(run, 2)
-    with pytest.raises(UsageError, match="has gone on past step-00000001"):
+    with pytest.raises(UsageError, match="has checkpoints after step-00000001"):
         checkpoint.find(run, str(first))
 
 

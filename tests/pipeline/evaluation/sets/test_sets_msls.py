@@ -99,7 +99,9 @@ def test_a_folder_with_other_queries_is_told_apart(tmp_path: Path) -> None:
 def test_utm_layout_is_restricted_to_the_official_queries(tmp_path: Path, listed: str, split: str) -> None:
     folder = tmp_path / "msls"
     utm_layout(folder, split)
-    with pytest.raises(DataError, match="740 official queries cannot be told from their names; put msls_val_qImages"):
+    with pytest.raises(
+        DataError, match="file names do not tell the 740 official queries from the others; put msls_val_qImages"
+    ):
         load_set("msls_val", EvaluationConfig(root=str(tmp_path)))
     names = [f"train_val/{city}/query/images/{city}_{which}.jpg" for city in CITIES for which in ("q", "far")]
     if listed == "npy":

@@ -104,7 +104,7 @@ def test_a_tensor_of_more_numbers_than_the_file_holds_is_refused(tmp_path: Path)
 def test_messages_hold_no_terminal_escapes_and_no_dangerous_advice(tmp_path: Path) -> None:
     path = tmp_path / "trap.pth"
     torch.save({"a": torch.zeros(1), "path": Path("x")}, path)
-    with pytest.raises(DataError, match=r"not loaded, .* foreign code is never run \(it asks for pathlib") as caught:
+    with pytest.raises(DataError, match=r"not loaded: .* code in a file is never run \(it asks for pathlib") as caught:
         read_tensors(str(path))
     assert str(caught.value).isprintable() and "weights_only" not in str(caught.value)
 
@@ -157,7 +157,7 @@ def test_an_index_names_files_beside_it_alone(tmp_path: Path, file: str | None) 
     folder.mkdir()
     (folder / "model.safetensors.index.json").write_text("[]" if file is None else f'{{"weight_map": {{"a": {file}}}}}')
     (tmp_path / "x.safetensors").touch()
-    with pytest.raises(DataError, match=r"index\.json: (not an index|.* is no file beside it)"):
+    with pytest.raises(DataError, match=r"index\.json: (not an index|.* is not beside it)"):
         read_tensors(str(folder))
     with pytest.raises(UsageError, match="no such weights file"):
         read_tensors(str(tmp_path / "nothing.pth"))

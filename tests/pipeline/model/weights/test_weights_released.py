@@ -274,5 +274,5 @@ def test_a_size_or_a_method_that_it_is_not() -> None:
 def test_code_in_a_checkpoint_is_never_run(tmp_path: Path) -> None:
     state = filled(CASES["SFRS"][2])
     torch.save({"state_dict": state, "args": Path("an object")}, tmp_path / "openibl.pth.tar")
-    with pytest.raises(DataError, match=r"openibl\.pth\.tar: not loaded.*foreign code is never run"):
+    with pytest.raises(DataError, match=r"openibl\.pth\.tar: not loaded.*code in a file is never run"):
         convert.kind_of(str(tmp_path / "openibl.pth.tar"))
