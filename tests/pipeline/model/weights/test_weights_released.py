@@ -241,7 +241,7 @@ def without(state: State, name: str) -> State:
          r"lacks 1.*'backbone\.6\.1\.bn2\.bias'"),
         ("EigenPlaces, bottlenecks", lambda s: s | {"extra.weight": torch.ones(1)}, r"1 unknown.*'extra\.weight'"),
         ("EigenPlaces, bottlenecks", lambda s: s | {"backbone.5.0.conv2.weight": torch.ones(16, 16, 1, 1)},
-         r"'backbone\.5\.0\.conv2\.weight' is 16 x 16 x 1 x 1.*want 16 x 16 x 3 x 3"),
+         r"'backbone\.5\.0\.conv2\.weight' is 16 x 16 x 1 x 1.*need 16 x 16 x 3 x 3"),
         ("CosPlace ResNet-18", lambda s: {n: t for n, t in s.items() if not n.startswith("backbone.7.1.")},
          r"\(2, 2, 2, 1\) blocks"),
         ("NetVLAD", lambda s: s | {"encoder.0.weight": torch.ones(64, 3, 11, 11)},
