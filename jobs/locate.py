@@ -1,7 +1,7 @@
 """Where was this photo taken? Answers from an index of your own photos, with or without positions.
 
     python -m jobs.locate --checkpoint outputs/RUN --build PHOTOS --index my-index
-    python -m jobs.locate --checkpoint outputs/RUN --index my-index --photos A.jpg B.jpg
+    python -m jobs.locate --checkpoint outputs/RUN --index my-index --photos A.jpg trip/ "b/*.jpg" drive.mp4
 
 PHOTOS are folders (positions from names, `@UTM_east@UTM_north@`, or from EXIF GPS) or manifests: .csv or .parquet with
 `image` and, if known, `lat` and `lon` or `utm_east` and `utm_north`. Building again describes only what is new: the
@@ -12,15 +12,21 @@ written to `<index>/answers/`: answers.json, and the photos beside their answers
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from jobs.cli import parse, run_job
 from pipeline.common.errors import UsageError
 from pipeline.common.files import check_writable
+
+if TYPE_CHECKING:
+    from pipeline.locate.answers import Answer
+    from pipeline.locate.no_match import Calibration
+    from pipeline.locate.photo_index import PhotoIndex
 
 SHOWN = 12  # photos that ask, in the picture; the text and the JSON have all
 
@@ -34,13 +40,27 @@ class LocateJob:
     index: str = ""
     """Folder of the index; belongs to the checkpoint that made it."""
     photos: tuple[str, ...] = ()
-    """Photos to be located, or folders of them."""
+    """Photos to be located, folders of them, patterns in quotes ("trip/*.jpg"), or videos (PyAV)."""
+    every: float = 1.0
+    """Seconds from frame to frame of a video."""
     build: tuple[str, ...] = ()
     """Folders of photos, or manifests, to make the index of; what it has of them already is not described again."""
     answers: int = 5
     """Places shown a photo."""
     output: str | None = None
     """Folder of the answers; none: `<index>/answers`."""
+    to: tuple[str, ...] = ()
+    """More files of the answers, by their ending: .geojson, .csv, .kml, or .txt (lines `query db`, pairs for hloc)."""
+    radius: float = 25.0
+    """Metres within which an answer is right, where a photo tells where it was taken."""
+    zone: str = ""
+    """Building: UTM zone, such as 31N, of metres that do not tell theirs."""
+    apart: float = 100.0
+    """Building: photos farther apart than so many metres are of different places ("not on this map" is calibrated on
+    them)."""
+    apart_frames: int | None = None
+    """Building, where no position is known: photos of one folder with more than so many between them are of different
+    places; none: not known, and no confidence is told."""
     search: Literal["exact", "ivfpq", "hnsw"] = "exact"
     """Building: exact search, or an approximate one for very many photos."""
     pca: int | None = None
@@ -75,17 +95,22 @@ def main() -> None:
         raise UsageError(f"--answers is {job.answers}; it must be at least 1")
     if job.batch is not None and job.batch < 1:
         raise UsageError(f"--batch is {job.batch}; it must be at least 1")
+    for name in ("every", "radius", "apart"):
+        if not 0 < getattr(job, name) < math.inf:
+            raise UsageError(f"--{name} is {getattr(job, name)}; it must be above 0")
+    if job.apart_frames is not None and job.apart_frames < 0:
+        raise UsageError(f"--apart_frames is {job.apart_frames}; it must be at least 0")
     run(job)
 
 
 def path_words(argv: Sequence[str]) -> list[str]:
-    """`--photos A.jpg B.jpg` and `--build A B` as one list each for the parser, whatever characters the names hold."""
+    """`--photos A.jpg B.jpg`, `--build A B` and `--to F G` as one list each for the parser, whatever the names hold."""
     words: list[str] = []
     paths: list[str] | None = None
     for word in [*argv, "--"]:
         if word.startswith("--"):
             words += [] if paths is None else [json.dumps(paths)]
-            paths = [] if word in ("--photos", "--build") else None
+            paths = [] if word in ("--photos", "--build", "--to") else None
             words.append(word)
         elif paths is None:
             words.append(word)
@@ -101,13 +126,21 @@ def run(job: LocateJob) -> None:
     from pipeline.config import EvaluationConfig
     from pipeline.evaluation.identity import model_digest
     from pipeline.locate.answers import locate
+    from pipeline.locate.asked import asked_photos
+    from pipeline.locate.exports import check_format
+    from pipeline.locate.no_match import Apart
     from pipeline.locate.photo_index import make_index, open_index
+    from pipeline.locate.photos import check_zone
     from pipeline.model.weights.files import checkpoint_file
     from pipeline.model.weights.load import load_any
 
-    photos = asked(job.photos)
-    device = job.device if job.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+    check_zone(job.zone)
+    for path in map(Path, job.to):
+        check_format(path)
+        check_writable(path.absolute().parent, "--to")
     file, folder = checkpoint_file(job.checkpoint), Path(job.index)
+    photos = asked_photos(job.photos, output_of(job) / "frames", job.every)
+    device = job.device if job.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
     if job.build:
         check_writable(folder, "--index")
     if photos and job.output:
@@ -122,7 +155,8 @@ def run(job: LocateJob) -> None:
         config = EvaluationConfig(groups=(groups,), resize=job.resize, precision=job.precision, search=job.search,
                                   pca=job.pca, batch=batch, workers=job.workers)  # fmt: skip
         sources, about = [Path(source) for source in job.build], {"checkpoint": str(file)}
-        index = make_index(model, sources, folder, config, device, fingerprint, about)
+        apart = Apart(job.apart, job.apart_frames)
+        index = make_index(model, sources, folder, config, device, fingerprint, about, zone=job.zone, apart=apart)
         where = {"none": "without positions", "utm": "with UTM positions", "degrees": "with latitude and longitude"}
         zone = f", zone {index.zone}" if index.zone else ""
         for remark in index.about["remarks"]:
@@ -130,60 +164,57 @@ def run(job: LocateJob) -> None:
         print(index.growth)
         size = f"{index.index.d:,} numbers each, {job.search} search, {index.about['bytes'] / 1e6:,.1f} MB"
         print(f"{folder}: {len(index.photos):,} photos {where[index.coordinates]}{zone}, {size}")
+        print(no_match_text(index.calibration))
     else:
         index = open_index(folder, fingerprint)
     if photos:
-        tell(job, index, locate(model, index, photos, job.answers, device))
+        tell(job, index, locate(model, index, photos, job.answers, device, radius=job.radius))
 
 
-def asked(given: Sequence[str]) -> list[Path]:
-    """The photos of the command line, folders unfolded. Raises `UsageError` for what is not there."""
-    from pipeline.evaluation.sets.evaluation_set import list_images
-
-    photos: list[Path] = []
-    for path in map(Path, given):
-        if not path.exists():
-            raise UsageError(f"{path}: no such photo")
-        photos += list_images(path) if path.is_dir() else [path]
-    return photos
+def output_of(job: LocateJob) -> Path:
+    """Folder of the answers."""
+    return Path(job.output) if job.output else Path(job.index) / "answers"
 
 
-def tell(job: LocateJob, index: object, answers: Sequence[object]) -> None:
+def no_match_text(calibration: Calibration) -> str:
+    """The index's threshold in a line for people."""
+    if calibration.threshold is None:
+        return f"no confidence is told, and nothing is called 'not on this map': {calibration.how}"
+    return f"probably not on this map: from distance {calibration.threshold:.3f} on (by {calibration.how})"
+
+
+def tell(job: LocateJob, index: PhotoIndex, answers: Sequence[Answer]) -> None:
     """Prints the answers and writes them down."""
     from pipeline.evaluation.report import figures
-    from pipeline.locate.answers import Answer, place_text
-    from pipeline.locate.photo_index import PhotoIndex
+    from pipeline.locate.exports import NO_MATCH, export, label, table
 
-    assert isinstance(index, PhotoIndex)
-    root = index.about["root"]
-    print(f"answers are photos below {root}\n")
-    rows, pictured = [], []
-    for answer in answers:
-        assert isinstance(answer, Answer)
-        gps = place_text(answer.own, "degrees") or (f"broken GPS: {answer.problem}" if answer.problem else "")
-        print(f"{answer.photo}  {gps}".rstrip())
-        notes = []
-        for rank, (place, far) in enumerate(zip(answer.places, answer.distances, strict=True), 1):
-            where = place_text(answer.positions[rank - 1], index.coordinates)
-            degrees, metres = place_text(answer.degrees[rank - 1], "degrees"), answer.metres[rank - 1]
-            away = "" if metres is None else f"{metres:,.0f} m away"
-            shown = place.relative_to(root) if place.is_relative_to(root) else place
-            told = "  ".join(filter(None, (where, degrees and f"({degrees})", away)))
-            print(f"  {rank:>2}  distance {far:.3f}  {shown}  {told}".rstrip())
-            notes.append((place, f"distance {far:.3f}\n{where or away}"))
-        rows.append(answer.to_dict(index.coordinates))
-        pictured.append((answer.photo, notes))
-    output = Path(job.output) if job.output else index.folder / "answers"
+    print(f"answers are photos below {index.about['root']}\n")
+    table(answers, index).print()
+    known = [answer.found[0].right for answer in answers if answer.found and answer.found[0].right is not None]
+    if known:
+        print(
+            f"\n* within {job.radius:g} m of the photo's own position; {sum(known)} of {len(known)} first answers are"
+        )
+    output = output_of(job)
     output.mkdir(parents=True, exist_ok=True)
-    about = {"index": str(index.folder), "fingerprint": index.about["fingerprint"], "protocol": index.about["protocol"]}
+    about = {"index": str(index.folder), "fingerprint": index.about["fingerprint"], "protocol": index.about["protocol"],
+             "utm_zone": index.zone, "no_match_from": index.calibration.threshold}  # fmt: skip
+    rows = [answer.to_dict() for answer in answers]
     (output / "answers.json").write_text(json.dumps({**about, "photos": rows}, indent=2) + "\n")
     written = [output / "answers.json"]
+    for path in map(Path, job.to):
+        export(answers, index, path)
+        written.append(path)
     if job.figures:
-        protocol = index.protocol
+        protocol, few = index.protocol, answers[:SHOWN]
         how = f"each photo beside {protocol.group_size} others" if protocol.groups == "bank" else "each photo alone"
         below = f"{len(index.photos):,} photos in {index.folder.name} · {protocol.search} search · {how}"
-        left = f", the first {SHOWN} of {len(pictured)}" if len(pictured) > SHOWN else ""
-        figures.answer_grid(pictured[:SHOWN], output / "answers.jpg", f"The most similar places{left}", below)
+        off = sum(answer.matched is False for answer in few)
+        below += f" · {off} {NO_MATCH}" if off else ""
+        left = f", the first {SHOWN} of {len(answers)}" if len(answers) > SHOWN else ""
+        pictured = [(answer.photo, [(found.place, label(found)) for found in answer.found]) for answer in few]
+        right = [[found.right for found in answer.found] for answer in few]
+        figures.answer_grid(pictured, output / "answers.jpg", f"The most similar places{left}", below, right)
         written.append(output / "answers.jpg")
     print("\nwritten: " + "  ".join(map(str, written)))
 

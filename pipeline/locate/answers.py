@@ -23,11 +23,45 @@ from pipeline.evaluation.describe.encode import describe_alone, evaluating
 from pipeline.evaluation.protocol import Protocol
 from pipeline.evaluation.search.approximate import search_index
 from pipeline.evaluation.sets.utm import WIDEST, meridian_offset, metres_between, to_utm
-from pipeline.locate.gps import gps_position
 from pipeline.locate.photo_index import PhotoIndex
+from pipeline.locate.photos import Taken, taken
 from pipeline.model.cross_image import Memory
 
-NAMES = {"utm": ("utm_east", "utm_north"), "degrees": ("lat", "lon")}
+NOWHERE = Taken()
+RADIUS = 25.0  # metres within which an answer is right, as the field counts
+
+
+@dataclass(frozen=True)
+class Found:
+    """One photo of an index that looks like the photo that asks."""
+
+    row: int
+    """Of the index."""
+    place: Path
+    distance: float
+    """L2 between descriptors of unit length: 0 the same, 1.41 nothing in common."""
+    confidence: float | None = None
+    """Share of photos from elsewhere that would be farther away (`no_match`); None where the index cannot tell."""
+    utm: tuple[float, float] | None = None
+    """East and north in metres, in the index's zone."""
+    degrees: tuple[float, float] | None = None
+    """Latitude and longitude."""
+    metres: float | None = None
+    """From where the photo itself says that it was taken; None where it, or the place, does not."""
+    right: bool | None = None
+    """Whether that is within the radius; None where it is not known."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values; what is not known is left out."""
+        entry: dict[str, Any] = {"place": str(self.place), "distance": self.distance}
+        if self.utm is not None:
+            entry |= {"utm_east": self.utm[0], "utm_north": self.utm[1]}
+        if self.degrees is not None:
+            entry |= {"lat": self.degrees[0], "lon": self.degrees[1]}
+        for name in ("confidence", "metres", "right"):
+            if getattr(self, name) is not None:
+                entry[name] = getattr(self, name)
+        return entry
 
 
 @dataclass(frozen=True)
@@ -35,34 +69,66 @@ class Answer:
     """The photos of an index that look most like one photo, best first."""
 
     photo: Path
-    rows: list[int]
-    places: list[Path]
-    distances: list[float]
-    """L2 between descriptors of unit length: 0 the same, 1.41 nothing in common."""
-    positions: list[tuple[float, float] | None]
-    """In the index's coordinates."""
-    degrees: list[tuple[float, float] | None]
-    """Latitude and longitude, where UTM positions were made of them."""
-    metres: list[float | None]
-    """From where the photo itself says that it was taken; None where it, or the place, does not."""
-    own: tuple[float, float] | None = None
-    """Latitude and longitude of the photo's own GPS."""
-    problem: str = ""
-    """What is wrong with the photo's own GPS, where something is."""
+    found: list[Found]
+    matched: bool | None = None
+    """False: probably not on this map; None where the index cannot tell."""
+    own: Taken = NOWHERE
+    """Where the photo itself says that it was taken."""
 
-    def to_dict(self, coordinates: str) -> dict[str, Any]:
-        """Plain values, coordinates under their names."""
-        found = []
-        for row, place in enumerate(self.places):
-            entry: dict[str, Any] = {"place": str(place), "distance": self.distances[row]}
-            for kind, position in ((coordinates, self.positions[row]), ("degrees", self.degrees[row])):
-                if position is not None:
-                    entry |= dict(zip(NAMES[kind], position, strict=True))
-            if self.metres[row] is not None:
-                entry["metres"] = self.metres[row]
-            found.append(entry)
-        own = {} if self.own is None else dict(zip(NAMES["degrees"], self.own, strict=True))
-        return {"photo": str(self.photo), **own, "answers": found}
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values; what is not known is left out."""
+        own: dict[str, Any] = {}
+        if self.own.degrees is not None:
+            own = {"lat": self.own.degrees[0], "lon": self.own.degrees[1]}
+        if self.matched is not None:
+            own["matched"] = self.matched
+        return {"photo": str(self.photo), **own, "answers": [found.to_dict() for found in self.found]}
+
+
+class Locator:
+    """A model and an index that are ready to answer."""
+
+    def __init__(self, model: nn.Module, index: PhotoIndex, device: torch.device | str, radius: float = RADIUS) -> None:
+        """`radius`: metres within which an answer is right. Raises `UsageError` for another bank than the index's."""
+        self.model, self.index, self.device, self.radius = model, index, torch.device(device), radius
+        with evaluating(model):
+            self._memory = memory_of(model, index.protocol)
+
+    def answer(self, photo: Path, count: int, data: bytes | None = None) -> Answer:
+        """The `count` most similar photos of the index (fewer where it holds fewer).
+
+        `data`: the photo's bytes; then `photo` is a name alone, and no file is read.
+
+        Raises:
+            DataError: the photo does not decode, or its descriptor is not finite.
+        """
+        index, protocol, source = self.index, self.index.protocol, photo if data is None else data
+        with evaluating(self.model):
+            described = describe_alone(
+                self.model, source, protocol.resize, protocol.precision, self.device, self._memory
+            )
+        if not np.isfinite(described).all():
+            raise DataError(f"{photo}: its descriptor is not finite: the model has diverged; take another one")
+        if index.projection is not None:
+            described = index.projection(described)
+        squared, rows = search_index(index.index, described, min(count, len(index.photos)))
+        kept = rows[0] >= 0  # an approximate search may find fewer
+        own = taken(photo.name, source, index.about.get("given_zone", ""))
+        found = [
+            self._found(int(row), float(np.sqrt(max(0.0, float(far)))), own)
+            for row, far in zip(rows[0][kept], squared[0][kept], strict=True)
+        ]
+        return Answer(photo, found, index.calibration.matched(found[0].distance) if found else None, own)
+
+    def _found(self, row: int, distance: float, own: Taken) -> Found:
+        index = self.index
+        position, degrees = _point(index.positions, row), _point(index.degrees, row)
+        if index.coordinates == "degrees":
+            degrees, position = position, None
+        metres = _metres(index, position, degrees, own)
+        right = None if metres is None else metres <= self.radius
+        confidence = index.calibration.confidence(distance)
+        return Found(row, index.photos[row], distance, confidence, position, degrees, metres, right)
 
 
 def locate(
@@ -72,6 +138,7 @@ def locate(
     count: int,
     device: torch.device | str,
     progress: bool = True,
+    radius: float = RADIUS,
 ) -> list[Answer]:
     """The `count` most similar photos of an index (fewer where it holds fewer) for each of `photos`.
 
@@ -79,38 +146,15 @@ def locate(
         DataError: photos that do not decode (all named, `broken_photos`), or whose descriptor is not finite.
         UsageError: the index was made beside another bank than the model has.
     """
-    device, protocol = torch.device(device), index.protocol
-    answers = []
-    with evaluating(model):
-        memory = memory_of(model, protocol)
-        for photo in track(photos, "locating", unit="photos") if progress else photos:
-            try:
-                described = describe_alone(model, photo, protocol.resize, protocol.precision, device, memory)
-            except DataError as error:
-                broken = [at for at, other in enumerate(photos) if problem_of(other)]
-                raise broken_photos(photos, broken, "photos to locate") from error
-            if not np.isfinite(described).all():
-                raise DataError(f"{photo}: its descriptor is not finite: the model has diverged; take another one")
-            if index.projection is not None:
-                described = index.projection(described)
-            squared, rows = search_index(index.index, described, min(count, len(index.photos)))
-            kept = rows[0] >= 0  # an approximate search may find fewer
-            found = [int(row) for row in rows[0][kept]]
-            distances = [float(d) for d in np.sqrt(np.maximum(squared[0][kept], 0))]
-            own, problem = gps_position(photo)
-            answers.append(
-                Answer(
-                    photo,
-                    found,
-                    [index.photos[row] for row in found],
-                    distances,
-                    [_point(index.positions, row) for row in found],
-                    [_point(index.degrees, row) for row in found],
-                    [_metres(index, row, own) for row in found],
-                    own,
-                    problem,
-                )
-            )
+    locator, answers = Locator(model, index, device, radius), []
+    for photo in track(photos, "locating", unit="photos") if progress else photos:
+        try:
+            answers.append(locator.answer(photo, count))
+        except DataError as error:
+            broken = [at for at, other in enumerate(photos) if problem_of(other)]
+            if not broken:
+                raise
+            raise broken_photos(photos, broken, "photos to locate") from error
     return answers
 
 
@@ -133,32 +177,24 @@ def memory_of(model: Any, protocol: Protocol) -> Memory | None:
     return memory
 
 
-def place_text(position: tuple[float, float] | None, coordinates: str) -> str:
-    """A position for people; empty where it is not known."""
-    if position is None:
-        return ""
-    if coordinates == "degrees":
-        return f"{position[0]:.6f}, {position[1]:.6f}"  # as map services take it
-    return f"{position[0]:.1f} E  {position[1]:.1f} N"
-
-
 def _point(positions: np.ndarray | None, row: int) -> tuple[float, float] | None:
     if positions is None or np.isnan(positions[row]).any():
         return None
     return float(positions[row, 0]), float(positions[row, 1])
 
 
-def _metres(index: PhotoIndex, row: int, own: tuple[float, float] | None) -> float | None:
-    """Distance of a photo's own GPS to a place: in the index's UTM zone, or along the ellipsoid."""
-    position = _point(index.positions, row)
-    if own is None or position is None:
+def _metres(
+    index: PhotoIndex, utm: tuple[float, float] | None, degrees: tuple[float, float] | None, own: Taken
+) -> float | None:
+    """Distance of a photo's own position to a place: in the index's UTM zone, or along the ellipsoid."""
+    if utm is not None and own.metres is not None and own.zone == index.zone:
+        return float(np.hypot(own.metres[0] - utm[0], own.metres[1] - utm[1]))
+    if own.degrees is None or degrees is None:
         return None
-    if index.coordinates == "degrees":
-        return float(metres_between(np.array(own), np.array(position)))
-    if not index.zone:
-        return None
-    zone, (latitude, longitude) = int(index.zone[:-1]), np.array(own).reshape(2, 1)
+    if utm is None:
+        return float(metres_between(np.array(own.degrees), np.array(degrees)))
+    zone, (latitude, longitude) = int(index.zone[:-1]), np.array(own.degrees).reshape(2, 1)
     if np.abs(meridian_offset(longitude, zone)).max() > WIDEST:
         return None  # another part of the world, where this zone's metres mean nothing
     (here,) = to_utm(latitude, longitude, zone, index.zone.endswith("S"))
-    return float(np.hypot(*(here - np.array(position))))
+    return float(np.hypot(*(here - np.array(utm))))

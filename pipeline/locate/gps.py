@@ -6,6 +6,7 @@ without a hemisphere, 0/0 fractions, NaN and the point (0, 0), which cameras wri
 
 from __future__ import annotations
 
+import io
 import math
 import warnings
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.common.pictures import FORMATS
 from pipeline.common.progress import Progress
 
 GPS = 0x8825  # the tag of the folder of GPS tags
@@ -21,16 +23,16 @@ AXES = (("GPSLatitude", 2, 1, "NS", 90.0), ("GPSLongitude", 4, 3, "EW", 180.0))
 NAMED = 5  # photos named in a line about broken positions
 
 
-def gps_position(path: Path) -> tuple[tuple[float, float] | None, str]:
+def gps_position(source: Path | bytes) -> tuple[tuple[float, float] | None, str]:
     """((latitude, longitude) in degrees, "") of a photo; (None, "") without GPS; (None, reason) where it is broken."""
     from PIL import Image
 
-    if not path.is_file():  # a pipe would be waited for; what is not there is named where its pixels are read
-        return None, ""
+    if isinstance(source, Path) and not source.is_file():
+        return None, ""  # a pipe would be waited for; what is not there is named where its pixels are read
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # other damaged EXIF
         try:
-            image = Image.open(path)
+            image = Image.open(source if isinstance(source, Path) else io.BytesIO(source), formats=FORMATS)
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
             return None, ""  # what does not open is named where its pixels are read
         with image:

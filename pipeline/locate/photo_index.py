@@ -7,8 +7,8 @@ build continues behind it. An index knows its weights and protocol, and is refus
 
 An index is a folder: `described/`, the descriptors of single photos (`kept.py`); `index-<number>/` with `index.faiss`,
 `photos.parquet` (`photo`, relative to `root` of `about.json` where it is below it, `bytes`, `modified`, and `first`,
-`second`, `lat`, `lon`, its coordinates or null), and `pca.safetensors` where PCA was asked for; and `about.json`, which
-names the number: without it there is no index.
+`second`, `lat`, `lon`, its coordinates or null), `calibration.json` (`no_match`), and `pca.safetensors` where PCA was
+asked for; and `about.json`, which names the number: without it there is no index.
 """
 
 from __future__ import annotations
@@ -38,10 +38,12 @@ from pipeline.evaluation.protocol import Protocol, protocols, read_protocol
 from pipeline.evaluation.search.approximate import build_index, load_index, save_index
 from pipeline.evaluation.search.projection import Projection, fit_rows, load_projection, projected, sample_rows
 from pipeline.locate.descriptor_cache import KeptDescriptors
+from pipeline.locate.no_match import SAMPLE, Apart, Calibration, calibrate
 from pipeline.locate.photos import Photos, find_photos
 
-FORMAT = "place-index 3"  # 3: the fingerprint is also of the model's config
+FORMAT = "place-index 4"  # 4: calibrated; latitude and longitude wherever the zone is known
 ABOUT, INDEX, PHOTOS, PCA = "about.json", "index.faiss", "photos.parquet", "pca.safetensors"
+CALIBRATION = "calibration.json"
 DESCRIBED, LOCK = "described", ".lock"
 LARGEST = 65_536  # images of a bank: all that it has
 
@@ -80,7 +82,7 @@ class PhotoIndex:
     positions: np.ndarray | None
     """float64 [n, 2] in `coordinates`, NaN rows where a photo has none; None where no photo has one."""
     degrees: np.ndarray | None
-    """Latitude and longitude [n, 2] that UTM positions were made of, where they were."""
+    """Latitude and longitude [n, 2] of UTM positions whose zone is known."""
     coordinates: str
     """utm (east, north in metres), degrees (latitude, longitude), or none."""
     zone: str
@@ -88,6 +90,8 @@ class PhotoIndex:
     protocol: Protocol
     projection: Projection | None
     about: dict[str, Any]
+    calibration: Calibration
+    """From which distance on a photo is probably not on the map."""
     growth: Growth | None = None
     """What the build did that made it; None for an index that was opened."""
 
@@ -101,6 +105,8 @@ def make_index(
     fingerprint: str,
     about: dict[str, Any] | None = None,
     progress: bool = True,
+    zone: str = "",
+    apart: Apart | None = None,
 ) -> PhotoIndex:
     """Makes the index in `folder` one of exactly the photos of `sources`, describing those it has not described yet.
 
@@ -111,10 +117,13 @@ def make_index(
             change the rounding of descriptors.
         fingerprint: identifies the model (`identity.model_digest`).
         about: more to be kept in `about.json`, such as the checkpoint's path.
+        zone: "31N", the UTM zone of metres that do not tell theirs.
+        apart: which photos are certainly of different places, to calibrate "not on this map"; None: the defaults.
 
     Raises:
-        DataError: no photos, one that does not decode (named), positions in some names only.
-        UsageError: more PCA dimensions than photos; a folder that holds other things, or that another build works in.
+        DataError: no photos, one that does not decode (named), positions that are none.
+        UsageError: metres of an unknown zone beside other positions; more PCA dimensions than photos; a folder that
+            holds other things, or that another build works in.
     """
     sources = [sources] if isinstance(sources, Path) else list(sources)
     groups: Any = ("bank",) if config.groups[0] == "bank" else ("single",)
@@ -123,7 +132,8 @@ def make_index(
     )
     bank = chosen_bank(model, config, (), device)
     protocol = protocols(config, int(model.image_size), "none", bank)[0]  # type: ignore[arg-type]
-    photos = find_photos(sources, progress)
+    apart = apart or Apart()
+    photos = find_photos(sources, progress, zone)
     with _building(folder):
         former = _former(folder)
         # of each photo by itself: `kept` compares the files one by one
@@ -139,7 +149,7 @@ def make_index(
                 each = describe_each(model, paths, config, torch.device(device), "describing", progress, memory)
                 kept.keep(photos.files, photos.states, ((rows[positions], values) for positions, values in each))
             found = kept.find(photos.files, photos.states)
-        contents = _contents(photos, protocol, fingerprint)
+        contents = _contents(photos, protocol, fingerprint, apart)
         place = _place(folder, former[0]) if former else folder
         if not former or former[0].get("contents") != contents or not (place / INDEX).is_file():
             number = 1 + max((int(f.name[6:]) for f in folder.glob("index-*") if f.name[6:].isdigit()), default=-1)
@@ -153,7 +163,13 @@ def make_index(
                     projection = fit_rows(blocks, sample, protocol.pca, protocol.whiten, name, device)
                     projection.save(place / PCA)
                     blocks = projected(blocks, projection)
-                save_index(build_index(blocks, config.search), place / INDEX)
+                built = build_index(blocks, config.search)
+                save_index(built, place / INDEX)
+                asked = sample_rows(len(photos.files), SAMPLE)
+                taken = np.concatenate([block[np.isin(rows, asked)] for rows, block in blocks()])
+                calibration = calibrate(built, photos, asked, taken, apart)
+                near = {"how": calibration.how, "elsewhere": calibration.elsewhere.tolist()}
+                (place / CALIBRATION).write_text(json.dumps(near) + "\n")
             _write_photos(photos, place / PHOTOS)
             for file in [*place.iterdir(), place]:
                 sync_path(file)
@@ -166,6 +182,7 @@ def make_index(
                 "photos": len(photos.files),
                 "coordinates": photos.coordinates,
                 "zone": photos.zone,
+                "given_zone": zone,
                 "protocol": protocol.to_dict(),
                 "bytes": (place / INDEX).stat().st_size,
                 "contents": contents,
@@ -214,6 +231,8 @@ def _open(folder: Path, fingerprint: str) -> PhotoIndex:
         table = pq.read_table(place / PHOTOS)
         root, protocol = Path(about["root"]), read_protocol(about["protocol"], str(folder))
         photos = [root / name for name in table["photo"].to_pylist()]
+        near = json.loads((place / CALIBRATION).read_text())
+        calibration = Calibration(np.array(near["elsewhere"], np.float64), str(near["how"]))
         pairs = [
             np.stack([table[name].to_numpy() for name in names], axis=1)
             for names in (("first", "second"), ("lat", "lon"))
@@ -226,7 +245,9 @@ def _open(folder: Path, fingerprint: str) -> PhotoIndex:
         raise DataError(f"{folder}: {index.ntotal} descriptors of {len(photos)} photos; build it again")
     projection = load_projection(place / PCA) if protocol.pca else None
     coordinates, zone = about["coordinates"], about["zone"]
-    return PhotoIndex(folder, index, photos, positions, degrees, coordinates, zone, protocol, projection, about)
+    return PhotoIndex(
+        folder, index, photos, positions, degrees, coordinates, zone, protocol, projection, about, calibration
+    )
 
 
 @contextlib.contextmanager
@@ -274,9 +295,9 @@ def _growth(
     return Growth(len(states) - len(both), len(both) - kept, len(old) - len(both), kept, described)
 
 
-def _contents(photos: Photos, protocol: Protocol, fingerprint: str) -> str:
+def _contents(photos: Photos, protocol: Protocol, fingerprint: str, apart: Apart) -> str:
     """Digest of the identity of all that the index is made of."""
-    seen = hashlib.sha256(json.dumps([FORMAT, photos.zone, photos.coordinates]).encode())
+    seen = hashlib.sha256(json.dumps([FORMAT, photos.zone, photos.coordinates, apart.metres, apart.frames]).encode())
     for array in (photos.positions, photos.degrees):
         seen.update(b"|" if array is None else np.ascontiguousarray(array).tobytes())
     files = hashlib.sha256("\n".join(map(str, photos.files)).encode("utf-8", "surrogateescape"))

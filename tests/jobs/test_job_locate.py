@@ -64,8 +64,10 @@ def test_build_and_ask_from_the_command_line(home: Path, model: PlaceModel) -> N
     code, text = start(home, *run, "--build", str(home / "utm"))
     assert code == 0 and "11 photos with UTM positions" in text, text
     asked = sorted((home / "asked").glob("*"))
-    code, text = start(home, *run, "--photos", *map(str, asked), "--answers", "3")
-    assert code == 0, text
+    questions = [str(home / "asked" / "*.*"), str(asked[0])]  # a pattern, and one of its photos again
+    files = [str(home / "out" / f"a.{ending}") for ending in ("geojson", "csv", "kml")]
+    code, text = start(home, *run, "--photos", *questions, "--answers", "3", "--to", *files)
+    assert code == 0 and all(Path(file).stat().st_size > 100 for file in files), text
     answers = json.loads((home / "index" / "answers" / "answers.json").read_text())["photos"]
     assert [Path(a["photo"]) for a in answers] == asked
     database = sorted((home / "utm").glob("*"))
@@ -77,7 +79,8 @@ def test_build_and_ask_from_the_command_line(home: Path, model: PlaceModel) -> N
         assert [a["utm_east"] for a in answer["answers"]] == [500000 + 50 * int(database[f].name.split("@p")[1][:-5])
                                                               for f in found]  # fmt: skip
     assert answers[0]["answers"][0]["distance"] < 2e-3 and "@p7@" in answers[0]["answers"][0]["place"]
-    assert "500350.0 E  4400000.0 N" in text
+    line = next(line for line in text.splitlines() if "@500350@4400000@p7@" in line and " 0.000 " in line)
+    assert line.split()[-2:] == ["500350.0", "4400000.0"] and "latitude" not in text  # of which zone is not known
     picture = np.asarray(Image.open(home / "index" / "answers" / "answers.jpg")).astype(int)
     assert (np.abs(picture - (0x3B, 0x6F, 0xB6)).max(-1) < 20).mean() > 0.01  # the frames of answers
 
@@ -89,8 +92,8 @@ def test_an_answer_does_not_depend_on_other_photos(home: Path, model: PlaceModel
     together = locate(model, index, asked, 4, "cpu", progress=False)
     for photo_asked, answer in zip(asked, together, strict=True):
         (alone,) = locate(model, index, [photo_asked], 4, "cpu", progress=False)
-        assert (alone.rows, alone.distances) == (answer.rows, answer.distances)  # to the last bit
-        assert alone.positions == [None] * 4
+        assert alone == answer and len(alone.found) == 4  # to the last bit
+        assert all(found.utm is None and found.degrees is None for found in alone.found)
 
 
 def test_saved_and_opened_with_positions_from_a_manifest(home: Path, model: PlaceModel, tmp_path: Path) -> None:
@@ -101,9 +104,10 @@ def test_saved_and_opened_with_positions_from_a_manifest(home: Path, model: Plac
     again = open_index(tmp_path / "index", "f")
     asked = [home / "asked" / "seven.png"]
     (first,), (second,) = (locate(model, index, asked, 20, "cpu", progress=False) for index in (made, again))
-    assert first == second and len(first.rows) == 11 and again.index.d == 5
-    assert first.positions[0] == pytest.approx((48.07, -0.875)) and first.places[0].name == "p07.jpg"
-    assert first.to_dict(again.coordinates)["answers"][0]["lat"] == pytest.approx(48.07)
+    assert first == second and len(first.found) == 11 and again.index.d == 5 and again.zone == "30N"
+    best = first.found[0]
+    assert best.degrees == pytest.approx((48.07, -0.875)) and best.place.name == "p07.jpg"
+    assert first.to_dict()["answers"][0]["lat"] == pytest.approx(48.07)
 
 
 def test_mistakes_are_one_line(home: Path, model: PlaceModel, tmp_path: Path) -> None:
@@ -118,6 +122,8 @@ def test_mistakes_are_one_line(home: Path, model: PlaceModel, tmp_path: Path) ->
         (["--checkpoint", str(home / "run"), "--photos", asked, "--index", str(tmp_path / "no")], 3, "no finished"),
         (["--checkpoint", str(home / "run"), "--build", str(home / "plain"), "--index", str(tmp_path)], 2, "other thi"),
         (["--checkpoint", str(home / "run")], 2, "nothing to do"),
+        (["--checkpoint", str(home / "run"), "--photos", asked, "--to", "a.gpx"], 2, "no known ending"),
+        (["--checkpoint", str(home / "run"), "--photos", asked, "--zone", "61N"], 2, "--zone is '61N'"),
     ]
     for options, wanted, message in cases:
         code, text = start(home, *options)

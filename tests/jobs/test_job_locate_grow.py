@@ -135,11 +135,15 @@ def test_several_folders_and_a_manifest(model: PlaceModel, photos: Path, tmp_pat
     again = make_index(model, [photos / "1", photos / "0"], tmp_path / "index", CONFIG, "cpu", "f", progress=False)
     assert str(again.growth) == "4 new, 0 changed, 0 gone, 8 kept"
     assert [p.name for p in again.photos][:2] == ["p01.jpg", "p03.jpg"]
-    with pytest.raises(UsageError, match=r"metres and .* in degrees"):
-        (tmp_path / "metres.csv").write_text("image,utm_east,utm_north\nphotos/1/p03.jpg,1,2\n")
-        (tmp_path / "degrees.csv").write_text("image,lat,lon\nphotos/1/p01.jpg,1,2\n")
-        both = [tmp_path / "metres.csv", tmp_path / "degrees.csv"]
+    (tmp_path / "metres.csv").write_text("image,utm_east,utm_north\nphotos/1/p03.jpg,500000,5000000\n")
+    (tmp_path / "degrees.csv").write_text("image,lat,lon\nphotos/1/p01.jpg,45.16,3.01\nphotos/1/p05.jpg,,\n")
+    both = [tmp_path / "metres.csv", tmp_path / "degrees.csv"]
+    with pytest.raises(UsageError, match=r"p03.*unknown UTM zone.*p01.*--zone 31N"):
         make_index(model, both, tmp_path / "index", CONFIG, "cpu", "f", progress=False)
+    mixed = make_index(model, both, tmp_path / "index", CONFIG, "cpu", "f", progress=False, zone="31N")
+    assert mixed.degrees is not None and mixed.positions is not None and mixed.zone == "31N"
+    np.testing.assert_allclose(mixed.degrees[:2], [[45.1535, 3.0], [45.16, 3.01]], atol=1e-4)
+    assert mixed.positions[0].tolist() == [500000, 5000000] and np.isnan(mixed.positions[2]).all()
 
 
 def test_killed_while_describing_the_old_index_answers_and_the_build_continues(
@@ -160,7 +164,7 @@ def test_killed_while_describing_the_old_index_answers_and_the_build_continues(
     assert len(open_index(index, fingerprint).photos) == 12
     asked = photos / "0" / "p04.jpg"
     (answer,) = locate(model, open_index(index, fingerprint), [asked], 1, "cpu", progress=False)
-    assert answer.places == [asked]
+    assert [found.place for found in answer.found] == [asked]
 
     survived = sum(map(len, in_parts(index))) - 12
     assert 3 <= survived < 60
@@ -246,10 +250,10 @@ def test_folders_that_are_no_index_and_builds_at_once_are_refused(
 def test_the_photo_itself_is_at_distance_zero(model: PlaceModel, photos: Path, tmp_path: Path) -> None:
     index = make_index(model, photos, tmp_path / "index", CONFIG, "cpu", "f", progress=False)
     for answer in locate(model, index, index.photos, 1, "cpu", progress=False):
-        assert (answer.places, answer.distances) == ([answer.photo], [0.0])
+        assert [(found.place, found.distance) for found in answer.found] == [(answer.photo, 0.0)]
     state = (photos / "0" / "p00.jpg").stat()
     photo(60, 0).save(photos / "0" / "p00.jpg", quality=95)
     os.utime(photos / "0" / "p00.jpg", ns=(state.st_atime_ns, state.st_mtime_ns + 1))
     again = make_index(model, photos, tmp_path / "index", CONFIG, "cpu", "f", progress=False)
     assert again.growth is not None and again.growth.changed == 1
-    assert np.isclose(locate(model, again, [photos / "0" / "p00.jpg"], 1, "cpu", False)[0].distances, 0).all()
+    assert np.isclose(locate(model, again, [photos / "0" / "p00.jpg"], 1, "cpu", False)[0].found[0].distance, 0)

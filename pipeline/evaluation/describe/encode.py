@@ -225,12 +225,17 @@ def _next(loader: Iterator[tuple[Tensor, list[int]]]) -> tuple[Tensor, list[int]
 
 
 def describe_alone(
-    model: nn.Module, photo: Path, resize: Any, precision: Any, device: torch.device, memory: Memory | None = None
+    model: nn.Module,
+    photo: Path | bytes,
+    resize: Any,
+    precision: Any,
+    device: torch.device,
+    memory: Memory | None = None,
 ) -> np.ndarray:
-    """The descriptor [1, dim] of one photo, in a forward pass of its own: other photos cannot even change its rounding.
+    """The descriptor [1, dim] of one photo (a file, or its bytes), in a forward pass of its own.
 
-    `memory`: of a bank (`PlaceModel.remember`), beside which it is described; None: in a group of its own. For a model
-    in `evaluating`. Raises `DataError` naming a broken photo.
+    So other photos cannot even change its rounding. `memory`: of a bank (`PlaceModel.remember`), beside which it is
+    described; None: in a group of its own. For a model in `evaluating`. Raises `DataError` naming a broken photo.
     """
     images = to_input(load_image(photo), int(model.image_size), resize)[None]  # type: ignore[arg-type]
     config = EvaluationConfig(precision=precision)

@@ -189,11 +189,19 @@ def retrieval_grid(
                 photo_tile(place(row, columns - 1), evaluated.database[positive], tile, BLUE, "a positive", where)
 
 
-def answer_grid(rows: Sequence[tuple[Path, Sequence[tuple[Path, str]]]], path: Path, title: str, below: str) -> None:
-    """A row for each photo that asked: the photo, then its (answer, label) pairs; nobody knows which are right.
+def answer_grid(
+    rows: Sequence[tuple[Path, Sequence[tuple[Path, str]]]],
+    path: Path,
+    title: str,
+    below: str,
+    right: Sequence[Sequence[bool | None]] | None = None,
+) -> None:
+    """A row for each photo that asked: the photo, then its (answer, label) pairs.
 
-    Labels have one or two lines: above the answer, and below it over the name of its file. An answer whose
-    file is no longer there leaves an empty tile that says so.
+    `right`: of each answer, for a green or a red frame; None, and all of them without it: not known, a blue frame.
+
+    Labels have one or two lines: above the answer, and below it over the name of its file. An answer whose file is no
+    longer there leaves an empty tile that says so.
     """
     columns = 1 + max(len(answers) for _, answers in rows)
     tile = (TILE, round(TILE / usual_aspect([photo for photo, _ in rows])))
@@ -207,7 +215,9 @@ def answer_grid(rows: Sequence[tuple[Path, Sequence[tuple[Path, str]]]], path: P
             shown = [(photo, INK, "where is this?", short_name(photo))]
             for rank, (file, text) in enumerate(answers, 1):
                 above, _, note = text.partition("\n")
-                shown.append((file, BLUE, f"{rank}   {above}", f"{note}\n{short_name(file)}".strip()))
+                known = None if right is None else right[row][rank - 1]
+                colour, sign = {True: (GREEN, "✓ "), False: (RED, "✗ "), None: (BLUE, "")}[known]
+                shown.append((file, colour, f"{sign}{rank}   {above}", f"{note}\n{short_name(file)}".strip()))
             for column, (file, colour, text, note) in enumerate(shown):
                 left, top = gap + column * (wide + gap), head + row * (high + label)
                 box = (left / width, 1 - (top + high) / height, wide / width, high / height)

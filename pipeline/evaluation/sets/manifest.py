@@ -9,6 +9,7 @@ Invariant: photos keep the order of the rows; every complaint names the file and
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +100,8 @@ def read_photos(path: Path) -> tuple[list[Path], np.ndarray | None, str]:
     """The photos of a manifest that need not be a set: paths, positions [n, 2] or None, and what these are.
 
     Coordinates: `utm` (east, north in metres), `degrees` (latitude, longitude), or `none`. Only `image` is needed;
-    where there is a `role`, the rows of role database count. Raises `DataError` for missing photos or values.
+    where there is a `role`, the rows of role database count. A row with both cells empty has no position: NaN. Raises
+    `DataError` for missing photos, and for values that are no numbers.
     """
     rows = _read(path)
     if rows and "role" in rows[0]:
@@ -109,9 +111,11 @@ def read_photos(path: Path) -> tuple[list[Path], np.ndarray | None, str]:
     photos = existing([path.parent / str(row["image"]) for row in rows], str(path))
     for kind, (first, second) in {"degrees": ("lat", "lon"), "utm": ("utm_east", "utm_north")}.items():
         if {first, second} <= rows[0].keys():
-            positions = np.stack([_numbers(path, rows, first), _numbers(path, rows, second)], axis=1)
-            if kind == "utm":
-                _in_metres(path, positions)
+            positions = np.full((len(rows), 2), np.nan)
+            told = [at for at, row in enumerate(rows) if not all(row[c] in (None, "") for c in (first, second))]
+            positions[told] = np.stack([_numbers(path, rows, c, told)[told] for c in (first, second)], axis=1)
+            if kind == "utm" and told:
+                _in_metres(path, positions[told])
             return photos, positions, kind
     return photos, None, "none"
 
@@ -133,10 +137,14 @@ def _read(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _numbers(path: Path, rows: list[dict[str, Any]], column: str) -> np.ndarray:
-    """A column as float64 [n]; `DataError` names the first row without a finite number."""
-    values = np.empty(len(rows))
-    for at, row in enumerate(rows):
+def _numbers(path: Path, rows: list[dict[str, Any]], column: str, only: Sequence[int] | None = None) -> np.ndarray:
+    """A column as float64 [n], of all rows or `only` some, NaN in the others.
+
+    `DataError` names the first of them without a finite number.
+    """
+    values = np.full(len(rows), np.nan)
+    for at in range(len(rows)) if only is None else only:
+        row = rows[at]
         try:
             values[at] = float(row[column])
         except (TypeError, ValueError):

@@ -139,6 +139,18 @@ def to_utm(
     return np.stack([east, north], axis=1)
 
 
+def from_utm(positions: np.ndarray, zone: int, south: bool) -> np.ndarray:
+    """Latitude and longitude, float64 [n, 2], of UTM east and north in metres [n, 2] (WGS84); NaN outside the Earth."""
+    from pyproj import Proj
+
+    longitude, latitude = Proj(proj="utm", zone=zone, south=south, ellps="WGS84")(
+        positions[:, 0], positions[:, 1], inverse=True
+    )
+    degrees = np.stack([latitude, longitude], axis=1)
+    degrees[~np.isfinite(degrees).all(axis=1)] = np.nan
+    return degrees
+
+
 def metres_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Distance in metres [n] along the WGS84 ellipsoid between (latitude, longitude) [n, 2] and [n, 2] (or [2])."""
     from pyproj import Geod

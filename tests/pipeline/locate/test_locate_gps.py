@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
-from tiny import photo
+from located import degrees, point, write
 from tiny_checkpoint import save_tiny
 
 from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.sets.utm import metres_between
-from pipeline.locate.answers import locate
+from pipeline.locate.answers import Answer, locate
 from pipeline.locate.gps import gps_position
 from pipeline.locate.photo_index import make_index, open_index
 from pipeline.locate.photos import find_photos
@@ -27,26 +26,8 @@ CN_TOWER = ("N", (43, 38, 33.24), "W", (79, 23, 13.7))  # zone 17, 630084 m east
 GOOD = {1: "N", 2: (48.0, 30.0, 0.0), 3: "E", 4: (2.0, 15.0, 36.0)}
 
 
-def write(path: Path, tags: dict[int, Any] | None, place: int = 0) -> Path:
-    """A JPEG or PNG of a place with the given GPS tags (1 to 4: reference and value of latitude, of longitude)."""
-    exif = Image.Exif()
-    exif[0x010F] = "a camera"
-    if tags is not None:
-        exif.get_ifd(0x8825).update(tags)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    photo(place, 0).save(path, exif=exif, **({} if path.suffix == ".png" else {"quality": 95}))
-    return path
-
-
-def point(north: str, latitude: Any, east: str, longitude: Any) -> dict[int, Any]:
-    return {1: north, 2: latitude, 3: east, 4: longitude}
-
-
-def degrees(latitude: float, longitude: float) -> dict[int, Any]:
-    """Tags of a point, split into degrees, minutes and seconds."""
-    seconds = [round(abs(value) * 3600, 6) for value in (latitude, longitude)]
-    parts = [(s // 3600, s % 3600 // 60, s % 60) for s in seconds]
-    return point("S" if latitude < 0 else "N", parts[0], "W" if longitude < 0 else "E", parts[1])
+def metres_of(answer: Answer, row: int) -> float | None:
+    return next(found.metres for found in answer.found if found.row == row)
 
 
 @pytest.fixture(scope="module")
@@ -118,14 +99,16 @@ def test_a_folder_goes_into_one_zone_and_photos_without_stay(tmp_path: Path) -> 
     far = np.hypot(*(photos.positions[3] - photos.positions[0]))
     assert far == pytest.approx(metres_between(photos.degrees[3], photos.degrees[0]), rel=0.006)
     assert far == pytest.approx(120_000, rel=0.01)  # 1.487 degrees of 80.67 km each at this latitude
-    assert len(photos.remarks) == 2 and "3 of 5 photos have a GPS position" in photos.remarks[1]
+    assert len(photos.remarks) == 2 and "3 of 5 photos have a position" in photos.remarks[1]
     assert "broken GPS, taken for none, in 1: " in photos.remarks[0] and "c zero.jpg: (0, 0)" in photos.remarks[0]
 
 
 def test_names_come_first_and_the_whole_world_stays_in_degrees(tmp_path: Path) -> None:
     write(tmp_path / "named" / "@500000@4400000@31@U@x@.jpg", degrees(10, 10))
     named = find_photos([tmp_path / "named"], progress=False)
-    assert (named.coordinates, named.zone, named.degrees) == ("utm", "31N", None)
+    assert (named.coordinates, named.zone) == ("utm", "31N")
+    assert named.degrees is not None and named.degrees[0, 1] == pytest.approx(3.0)
+    assert metres_between(named.degrees[0], np.array([0.0, 3.0])) * 0.9996 == pytest.approx(4400000, abs=0.01)
     assert named.positions is not None and named.positions.tolist() == [[500000, 4400000]]
     write(tmp_path / "world" / "a.jpg", degrees(-33.5, 151.25))
     write(tmp_path / "world" / "b.jpg", degrees(51.5, -0.125))
@@ -143,19 +126,22 @@ def test_answers_tell_how_far_the_photo_says_it_was(model: PlaceModel, tmp_path:
     assert index.zone == "32N" and index.degrees is not None
     asked = write(tmp_path / "asked.jpg", degrees(45.0, 7.5), 2)
     (answer,) = locate(model, index, [asked], 6, "cpu", progress=False)
-    assert answer.own == pytest.approx((45, 7.5), abs=1e-6)
-    for row, metres in zip(answer.rows, answer.metres, strict=True):
-        if row == 4:
-            assert metres is None and answer.positions[answer.rows.index(4)] is None
+    assert answer.own.degrees == pytest.approx((45, 7.5), abs=1e-6)
+    for found in answer.found:
+        if found.row == 4:
+            assert found.metres is None and found.right is None and found.utm is None
         else:
-            assert metres == pytest.approx(1852.2 * row, rel=1e-3, abs=0.01)
-    first = answer.to_dict("utm")["answers"][0]
+            assert found.metres == pytest.approx(1852.2 * found.row, rel=1e-3, abs=0.01)
+            assert found.right == (found.row == 0)
+    first = answer.to_dict()["answers"][0]
     assert (first["lat"], first["lon"]) == pytest.approx((45 + 2 / 60, 7.5)) and first["metres"] > 3000
     (plain,) = locate(model, index, [write(tmp_path / "plain.jpg", None, 2)], 6, "cpu", progress=False)
-    assert plain.own is None and plain.metres == [None] * 6 and plain.rows == answer.rows
+    rows = [found.row for found in answer.found]
+    assert plain.own.degrees is None and [f.metres for f in plain.found] == [None] * 6
+    assert [found.row for found in plain.found] == rows
     broken = write(tmp_path / "broken.jpg", degrees(0, 0), 2)
     (told,) = locate(model, index, [broken], 1, "cpu", progress=False)
-    assert told.own is None and "(0, 0)" in told.problem and told.rows == answer.rows[:1]
+    assert told.own.degrees is None and "(0, 0)" in told.own.problem and told.found[0].row == rows[0]
 
 
 def test_southern_and_degrees_indices_measure_too(model: PlaceModel, tmp_path: Path) -> None:
@@ -165,15 +151,15 @@ def test_southern_and_degrees_indices_measure_too(model: PlaceModel, tmp_path: P
     asked = write(tmp_path / "north.jpg", degrees(0.01, 33.0), 0)  # over the equator, from an index south of it
     (answer,) = locate(model, index, [asked], 3, "cpu", progress=False)
     assert index.zone == "36S"
-    assert answer.metres[answer.rows.index(0)] == pytest.approx(0.03 * 110_574 * 0.9996, rel=1e-3)
+    assert metres_of(answer, 0) == pytest.approx(0.03 * 110_574 * 0.9996, rel=1e-3)
     (tmp_path / "list.csv").write_text("image,lat,lon\np/0.jpg,-0.02,33\np/1.jpg,-0.01,33\n")
     listed = make_index(model, tmp_path / "list.csv", tmp_path / "listed", CONFIG, "cpu", "f", progress=False)
     (answer,) = locate(model, listed, [asked], 2, "cpu", progress=False)
-    assert answer.metres[answer.rows.index(0)] == pytest.approx(0.03 * 110_574, rel=0.006)
+    assert metres_of(answer, 0) == pytest.approx(0.03 * 110_574, rel=0.006)
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / "@1@2@.jpg").write_bytes((tmp_path / "p" / "0.jpg").read_bytes())
     unknown = make_index(model, tmp_path / "x", tmp_path / "unknown", CONFIG, "cpu", "f", progress=False)
-    assert locate(model, unknown, [asked], 1, "cpu", progress=False)[0].metres == [None]  # metres of which zone?
+    assert locate(model, unknown, [asked], 1, "cpu", progress=False)[0].found[0].metres is None  # metres of which zone?
     with pytest.raises(DataError, match="no jpg"):
         (tmp_path / "empty").mkdir()
         make_index(model, tmp_path / "empty", tmp_path / "index", CONFIG, "cpu", "f", progress=False)

@@ -177,7 +177,7 @@ def test_every_way_to_a_descriptor_takes_the_bank_of_the_model(tmp_path: Path, p
     assert index.protocol.name.startswith("bank6_28px") and index.protocol.bank_digest == built.bank.digest
     answers = locate(built, index, paths, 2, device, progress=False)
     rows = [photos.database.index(path) for path in paths]
-    assert [answer.rows[0] for answer in answers] == rows and max(answer.distances[0] for answer in answers) == 0
+    assert [a.found[0].row for a in answers] == rows and max(a.found[0].distance for a in answers) == 0
     built.bank = make_bank(torch.randn(6, built.regions, 16), "train")
     with pytest.raises(UsageError, match=r"made beside the bank .* build the index again"):
         locate(built, index, paths, 2, device, progress=False)
