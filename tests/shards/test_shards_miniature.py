@@ -22,7 +22,7 @@ from shards.sources.miniature import MiniatureConfig, draw
 from shards.sources.miniature.photograph import Studio
 from shards.sources.miniature.plan import STEP, degrees, plan_photos
 
-PLACES, VAL, TEST, SIZE = 16, 4, 6, (96, 72)
+PLACES, VAL, TEST, SIZE = 10, 2, 4, (96, 72)
 CITY = MiniatureConfig(places=PLACES, seed=3, width=96, height=72, workers=1, val_places=VAL, test_places=TEST)
 COLUMNS = ["place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid"]
 

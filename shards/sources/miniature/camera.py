@@ -49,14 +49,6 @@ class Camera:
         """[n, 3] homogeneous pixels; the last column is the depth in metres."""
         return np.asarray((np.array(points) - (self.x, self.y, self.z)) @ self.matrix.T)
 
-    def sees(self, x0: float, z0: float, x1: float, z1: float) -> bool:
-        """Whether something between these corners on the ground may be in the picture."""
-        feet = self.project([(x, 0.0, z) for x in (x0, x1) for z in (z0, z1)])
-        if feet[:, 2].min() < NEAR:
-            return bool(feet[:, 2].max() > NEAR)
-        columns = feet[:, 0] / feet[:, 2]
-        return bool(columns.max() > -8 and columns.min() < self.width + 8)
-
     def polygon(self, points: Sequence[Point]) -> Pixels:
         """Pixels of a convex polygon, cut at the near plane; empty when it is out of sight."""
         rows = self.project(points).tolist()

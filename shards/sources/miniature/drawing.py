@@ -12,16 +12,18 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from pipeline.common.errors import DataError, UsageError
+from pipeline.common.files import write_atomically
 from pipeline.common.progress import Progress
 from shards.sources.miniature.photograph import Studio
 from shards.sources.miniature.plan import PlacePhotos, data_frames, plan_photos
 
-FORMAT = 3  # of the pictures: raise it when a change of the drawing changes their bytes
+FORMAT = 4  # of the pictures: raise it when a change of the drawing changes their bytes
 
 
 @dataclass(frozen=True)
@@ -55,14 +57,13 @@ class MiniatureConfig:
         """
         val = max(self.places // 5, 2) if self.val_places is None else self.val_places
         test = max(self.places // 3, 2) if self.test_places is None else self.test_places
-        given = {
-            "places": (self.places, 1, 22_000), "val_places": (val, 0, 22_000), "test_places": (test, 0, 22_000),
-            "street_places": (self.street_places, 1, 20), "width": (self.width, 32, 2048),
-            "height": (self.height, 32, 2048), "workers": (1 if self.workers is None else self.workers, 1, 4096),
-        }  # fmt: skip
-        for name, (value, low, high) in given.items():
-            if not low <= value <= high:
-                raise UsageError(f"{name} = {value}: must be {low} to {high}")
+        limits = {"places": (1, 22_000), "street_places": (1, 20), "width": (32, 2048), "height": (32, 2048)}
+        limits |= {"val_places": (0, 22_000), "test_places": (0, 22_000), "workers": (1, 4096)}
+        workers = 1 if self.workers is None else self.workers
+        given = {**vars(self), "val_places": val, "test_places": test, "workers": workers}
+        for name, (low, high) in limits.items():
+            if not low <= given[name] <= high:
+                raise UsageError(f"{name} = {given[name]}: must be {low} to {high}")
         if max(self.places, val, test) > 1100 * self.street_places:
             raise UsageError(f"places = {max(self.places, val, test)}: the map has room for 1100 streets of a split")
         return self.places, val, test
@@ -106,7 +107,7 @@ def draw(config: MiniatureConfig) -> MiniatureSummary:
         for path, text in data_frames(planned).items():  # last: a reader that finds them finds every photo
             if not (out / path).is_file() or (out / path).read_text() != text:
                 (out / path).parent.mkdir(parents=True, exist_ok=True)
-                write_whole(out / path, text.encode())
+                write_atomically(out / path, text.encode())
     except OSError as error:
         raise DataError(f"{error.filename or out}: the miniature cannot be written there ({error.strerror})") from error
     photos = Counter("gsv" if file.startswith("gsv") else "/".join(file.split("/")[-3:-1]) for file in files)
@@ -120,7 +121,7 @@ def _claim(out: Path, config: MiniatureConfig, counts: tuple[int, int, int]) -> 
     note = out / "miniature.json"
     if not note.is_file():
         out.mkdir(parents=True, exist_ok=True)
-        write_whole(note, (json.dumps(settings, indent=1) + "\n").encode())
+        write_atomically(note, (json.dumps(settings, indent=1) + "\n").encode())
         return
     try:
         found = json.loads(note.read_text())
@@ -134,34 +135,22 @@ def _claim(out: Path, config: MiniatureConfig, counts: tuple[int, int, int]) -> 
 def _run(out: Path, missing: list[PlacePhotos], config: MiniatureConfig) -> Iterator[int]:
     """Draws the places, and yields how many photos are done each time some are."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    parts, size = [missing[k : k + 8] for k in range(0, len(missing), 8)], (config.width, config.height)
-    workers = min(config.workers or cores, len(parts))
+    parts = [missing[k : k + 8] for k in range(0, len(missing), 8)]
+    job, workers = partial(_draw_some, out, (config.width, config.height)), min(config.workers or cores, len(parts))
     if workers < 2:
-        yield from (_draw_some(out, part, size) for part in parts)
+        yield from map(job, parts)
         return
     # spawn: the caller may hold threads (torch, OpenMP) that a fork would break
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(_draw_some, out, part, size) for part in parts]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        yield from pool.map(job, parts)
 
 
-def _draw_some(out: Path, places: list[PlacePhotos], size: tuple[int, int]) -> int:
+def _draw_some(out: Path, size: tuple[int, int], places: list[PlacePhotos]) -> int:
     """Draws and writes the photos of these places; neighbours on a street share its facades."""
     street, studio = None, None
     for place in places:
         if studio is None or place.seed != street:
             street, studio = place.seed, Studio(place.town, place.seed, place.length)
         for photo in place.photos:
-            write_whole(out / photo.file, studio.photograph(photo, size))
+            write_atomically(out / photo.file, studio.photograph(photo, size))
     return sum(len(place.photos) for place in places)
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Writes under a temporary name, then renames: the name never shows half a file."""
-    temporary = path.with_name(f".{os.getpid()}.{path.name[-40:]}.part")
-    temporary.write_bytes(content)
-    temporary.replace(path)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageChops, ImageDraw, ImageFont
 
 from shards.sources.miniature.place import Building
@@ -49,13 +50,15 @@ class Wall:
         if c > a and d > b:
             self.draw.rectangle((a, b, max(c - 1, a), max(d - 1, b)), fill=colour)
 
-    def disc(self, x: float, y: float, r: float, colour: RGB) -> None:
-        self.draw.ellipse(self.box(x - r, y - r, x + r, y + r), fill=colour)
+    def disc(self, x: float, y: float, r: float, colour: RGB, start: int = 0) -> None:
+        """A disc, or with a `start` of 180 its upper half."""
+        self.draw.pieslice(self.box(x - r, y - r, x + r, y + r), start, 360, fill=colour)
 
     def pane(self, x0: float, y0: float, x1: float, y1: float, colour: RGB, lit: float = 0.36) -> None:
         """A window's glass, lit after dark with this chance."""
-        self.rect(x0, y0, x1, y1, colour)
-        self.panes.append((self.box(x0, y0, x1, y1), lit))
+        if x1 > x0:
+            self.rect(x0, y0, x1, y1, colour)
+            self.panes.append((self.box(x0, y0, x1, y1), lit))
 
     def window(self, x: float, y: float, w: float, h: float) -> None:
         """One window with its lower left corner at (x, y)."""
@@ -71,12 +74,11 @@ class Wall:
         if f.window == "sash":
             self.rect(x, y + h / 2 - 0.05, x + w, y + h / 2 + 0.05, f.trim)
         elif f.window == "arch":
-            for r, colour in ((w / 2 + 0.14, tone(f.trim, 0.9)), (w / 2 - 0.06, tone(glass, 0.75))):
-                self.draw.pieslice(self.box(x + w / 2 - r, y + h - r, x + w / 2 + r, y + h + r), 180, 360, fill=colour)
+            self.disc(x + w / 2, y + h, w / 2 + 0.14, tone(f.trim, 0.9), 180)
+            self.disc(x + w / 2, y + h, w / 2 - 0.06, tone(glass, 0.75), 180)
         elif f.window == "shutter":
             for s in (x - 0.14 - w * 0.48, x + w + 0.14):
                 self.rect(s, y - 0.05, s + w * 0.48, y + h + 0.05, f.accent)
-                self.rect(s + 0.1, y + 0.1, s + w * 0.48 - 0.1, y + h - 0.1, tone(f.accent, 0.8))
 
     def cut(self, edge: list[tuple[float, float]]) -> None:
         """Takes away what lies above a line from the left to the right edge, and draws its coping."""
@@ -86,20 +88,24 @@ class Wall:
         self.draw.line(line, fill=tone(self.family.trim, 0.95), width=5)
 
 
+def blotches(rng: np.random.Generator, shape: tuple[int, int], octaves: dict[int, float]) -> NDArray[np.float64]:
+    """Smooth noise of this shape: the sum of grids of so many rows, each with its strength."""
+    total, (high, wide) = np.zeros(shape), shape
+    for rows, strength in octaves.items():
+        coarse = Image.fromarray(rng.normal(0, strength, (rows, rows * wide // high)).astype(np.float32))
+        total += np.asarray(coarse.resize((wide, high), Image.Resampling.BICUBIC))
+    return total
+
+
 @lru_cache(maxsize=8)
 def masonry(kind: str) -> Image.Image:
-    """A 512 x 512 RGB relief of courses and stains, to multiply a wall's colour with."""
-    rng, relief = np.random.default_rng([3, *map(ord, kind)]), np.full((512, 512), 238.0)
-    for cells, weight in ((8, 9.0), (32, 7.0), (512, 6.0)):
-        coarse = Image.fromarray(rng.normal(0, weight, (cells, cells)).astype(np.float32))
-        relief += np.asarray(coarse.resize((512, 512), Image.Resampling.BICUBIC))
+    """512 x 512 pixels of courses and stains."""
+    relief = 238 + blotches(np.random.default_rng([3, *map(ord, kind)]), (512, 512), {8: 9.0, 32: 7.0, 512: 6.0})
     course = {"brick": 3, "stone": 8, "timber": 4}.get(kind, 512)
     relief[::course] *= 0.85
-    if kind == "stone":
-        for row in range(0, 512, course):
-            relief[row : row + course, 9 * (row // course % 2) :: 18] *= 0.88
-    grey = Image.fromarray(relief.clip(120, 255).astype(np.uint8))
-    return Image.merge("RGB", (grey, grey, grey))
+    for row in range(0, 512, course) if kind == "stone" else ():
+        relief[row : row + course, 9 * (row // course % 2) :: 18] *= 0.88
+    return Image.fromarray(relief.clip(120, 255).astype(np.uint8)).convert("RGB")
 
 
 lettering = lru_cache(maxsize=16)(ImageFont.load_default)  # Pillow's own font: pictures do not depend on the machine
@@ -116,111 +122,85 @@ def front(b: Building, width: float) -> Wall:
     count = max(int((width - 0.8) / f.bay), 1)
     step = (width - 0.8) / count
     bays = [0.4 + (k + 0.5) * step for k in range(count)]  # their middles
-    _floors(wall, b.floors, bays, step)
+    for floor in range(1, b.floors):
+        _storey(wall, floor * f.storey, bays, step)
     _ground(wall, bays, step)
     if f.roof in ("gable", "stepped"):
         _gable(wall, up, rise)
         return wall
-    wall.rect(0, up - 0.5, width, up - 0.35, tone(f.trim, 0.6))
-    wall.rect(0, up - 0.35, width, up, tone(f.trim, 0.92))
+    wall.rect(0, up - 0.35, width, up, tone(f.trim, 0.85))
     wall.ledges.append((0, width, up))
-    wall.rect(0, up, width, up + rise, f.roof_colour)
+    wall.rect(0, up, width, up + rise, f.tiles)
     for x in bays if f.roof == "mansard" else ():
         wall.rect(x - 0.75, up + 0.3, x + 0.75, up + 2.2, tone(f.trim, 0.95))
         wall.pane(x - 0.5, up + 0.4, x + 0.5, up + 1.9, GLASS)
-        wall.ledges.append((x - 0.8, x + 0.8, up + 2.2))
     return wall
 
 
 def side(b: Building, width: float) -> Wall:
-    """A plain side wall: few windows, sometimes a wall painting of coloured discs."""
+    """A plain side wall with few windows."""
     wall = Wall(b, width, MANSARD if b.family.roof == "mansard" and not b.landmark else 0.0, 2)
-    rng = wall.rng
-    wall.rect(0, b.height, width, wall.height, b.family.roof_colour)
-    if b.mural:
-        high = min(b.height - 1.0, 9.0)
-        wall.rect(0.6, 0.8, width - 0.6, high, SIGN_COLOURS[b.seed % 5])
-        for k, (x, y, r) in enumerate(rng.uniform((2.5, 2.7, 0.5), (width - 2.5, high - 1.8, 1.8), (9, 3)).tolist()):
-            wall.disc(x, y, r, tone(SIGN_COLOURS[k % 8], 1.1))
-        return wall
+    wall.rect(0, b.height, width, wall.height, b.family.tiles)
     for floor in range(b.floors):
-        for x in np.arange(1.6, width - 1.6, b.family.bay * 2):
-            if rng.random() < 0.35:
-                wall.window(float(x), floor * b.family.storey + 1.2, 0.9, 1.4)
+        for x in np.arange(1.6, width - 1.6, b.family.bay * 2).tolist():
+            if wall.rng.random() < 0.35:
+                wall.window(x, floor * b.family.storey + 1.2, 0.9, 1.4)
     return wall
 
 
-def _floors(wall: Wall, floors: int, bays: list[float], step: float) -> None:
-    """The grid of windows above the ground floor."""
-    f, rng, w = wall.family, wall.rng, wall.width
-    band, railing, tall = rng.random() < 0.4, rng.random(floors) < f.balconies, f.window == "french"
-    wide, high = min(step * 0.5, 1.15), (2.2 if tall else 1.55)
-    for floor in range(1, floors):
-        y = floor * f.storey
-        if f.window in ("curtain", "ribbon"):  # glass from wall to wall
-            low, top = (y + 0.5, y + f.storey - 0.1) if f.window == "curtain" else (y + 0.9, y + 2.3)
-            wall.rect(0.2, low - 0.2, w - 0.2, top, tone(f.trim, 0.9))
-            for x in bays:
-                glass = (142, 160, 170) if rng.random() < 0.35 else (96, 122, 142)
-                wall.pane(
-                    x - step / 2 + 0.06, low, x + step / 2 - 0.06, top, tone(glass, float(rng.uniform(0.75, 1.15)))
-                )
-            continue
-        if band:
-            wall.rect(0, y - 0.1, w, y + 0.12, tone(f.trim, 0.88))
+def _storey(wall: Wall, y: float, bays: list[float], step: float) -> None:
+    """The windows of an upper storey whose floor is at y, with its balcony."""
+    f, rng, w, tall = wall.family, wall.rng, wall.width, wall.family.window == "french"
+    if f.window in ("curtain", "ribbon"):  # glass from wall to wall
+        low, top = (y + 0.5, y + f.storey - 0.1) if f.window == "curtain" else (y + 0.9, y + 2.3)
+        wall.rect(0.2, low - 0.2, w - 0.2, top, tone(f.trim, 0.9))
         for x in bays:
-            wall.window(x - wide / 2, y + (0.25 if tall else 0.85), wide, high)
-        if railing[floor]:
-            start, end = (0.2, w - 0.2) if tall else (bays[0] - step * 0.4, bays[-1] - step * 0.4)
-            wall.rect(start, y - 0.05, end, y + 0.2, tone(f.trim, 0.75))
-            wall.rect(start, y + 1.0, end, y + 1.1, f.accent)
-            for x in np.arange(start, end, 0.27):
-                wall.rect(float(x), y + 0.2, float(x) + 0.07, y + 1.0, f.accent)
+            glass = tone((142, 160, 170) if rng.random() < 0.35 else (96, 122, 142), float(rng.uniform(0.75, 1.15)))
+            wall.pane(x - step / 2 + 0.06, low, x + step / 2 - 0.06, top, glass)
+        return
+    wide, high = min(step * 0.5, 1.15), (2.2 if tall else 1.55)
+    for x in bays:
+        wall.window(x - wide / 2, y + (0.25 if tall else 0.85), wide, high)
+    if rng.random() < f.railed:
+        wall.rect(0.2, y - 0.05, w - 0.2, y + 0.2, tone(f.trim, 0.75))
+        wall.rect(0.2, y + 1.0, w - 0.2, y + 1.1, f.accent)
+        for x in np.arange(0.2, w - 0.2, 0.27).tolist():
+            wall.rect(x, y + 0.2, x + 0.07, y + 1.0, f.accent)
 
 
 def _ground(wall: Wall, bays: list[float], step: float) -> None:
-    """A door, and a shop with its sign and awning or plain windows."""
+    """A door, and a shop with its sign or plain windows."""
     f, rng, w, top = wall.family, wall.rng, wall.width, wall.family.storey
     door, paint = float(rng.choice([0.7, w - 1.9, w / 2 - 0.6])), SIGN_COLOURS[int(rng.integers(len(SIGN_COLOURS)))]
     if rng.random() < f.shops and w > 4.5:
         wall.rect(0.2, 0, w - 0.2, top - 0.15, tone(paint, 0.8) if rng.random() < 0.6 else tone(f.trim, 0.7))
-        for x0, x1 in ((0.5, door - 0.25), (door + 1.45, w - 0.5)):
-            if x1 - x0 > 0.8:
-                wall.pane(x0, 0.5, x1, top - 1.05, (70, 82, 90), 0.85)
+        wall.pane(0.5, 0.5, door - 0.25, top - 1.05, (70, 82, 90), 0.85)
+        wall.pane(door + 1.45, 0.5, w - 0.5, top - 1.05, (70, 82, 90), 0.85)
         wall.rect(0.2, top - 0.95, w - 0.2, top - 0.2, paint)
-        word = SIGNS[int(rng.integers(len(SIGNS)))]
+        word = str(rng.choice(SIGNS))
         font = lettering(max(int(min(0.62, (w - 1.0) / (0.62 * len(word))) * PX), 5))
         at, ink = (w / 2 * PX, (wall.height - top + 0.6) * PX), PAPER if sum(paint) < 420 else INK
         wall.draw.text(at, word, fill=ink, font=font, anchor="mm")
-        stripe = (w - 0.4) / max(int(w / 0.6), 2)
-        for k in range(max(int(w / 0.6), 2) if rng.random() < 0.45 else 0):  # an awning
-            x = 0.2 + k * stripe
-            wall.rect(x, top - 1.6, x + stripe, top - 0.95, PAPER if k % 2 else paint)
-            wall.ledges.append((x, x + stripe, top - 0.95))
+        if rng.random() < 0.45:  # an awning
+            for k, x in enumerate(np.arange(0.2, w - 0.5, 0.6).tolist()):
+                wall.rect(x, top - 1.6, x + 0.6, top - 0.95, PAPER if k % 2 else paint)
     else:
         for x in bays:
             if abs(x - door - 0.55) > 1.5:
                 wall.window(x - 0.55, 1.0, min(1.1, step * 0.55), 1.4)
-    leaf = f.accent if rng.random() < 0.6 else paint
     wall.rect(door - 0.15, 0, door + 1.3, 2.5, tone(f.trim, 0.85))
-    wall.rect(door, 0, door + 1.15, 2.1, leaf)
-    wall.rect(door + 0.15, 1.1, door + 1.0, 1.9, tone(leaf, 0.7))
-    wall.pane(door, 2.15, door + 1.15, 2.4, GLASS)
+    wall.rect(door, 0, door + 1.15, 2.3, f.accent if rng.random() < 0.6 else paint)
 
 
 def _gable(wall: Wall, eave: float, rise: float) -> None:
     """Cuts the wall's top into a triangle or steps, with the attic's window."""
     w, top = wall.width, eave + rise - 0.05
     wall.window(w / 2 - 0.45, eave + rise * 0.12, 0.9, min(1.3, rise * 0.45))
-    if wall.family.roof == "gable":
-        wall.cut([(0, eave), (w / 2, top), (w, eave)])
-        return
     left = [(0.0, eave)]
-    for k in range(1, 6):
+    for k in range(1, 6) if wall.family.roof == "stepped" else ():
         high = eave + k * (top - eave) / 5
         left += [(left[-1][0], high), (w * 0.5 * k / 5.8, high)]
-        wall.ledges += [(left[-2][0], left[-1][0], high), (w - left[-1][0], w - left[-2][0], high)]
-    wall.cut([*left, *[(w - x, y) for x, y in reversed(left)]])
+    wall.cut([*left, (w / 2, top), *[(w - x, y) for x, y in reversed(left)]])
 
 
 def _landmark(wall: Wall, eave: float, church: bool) -> None:
@@ -238,5 +218,4 @@ def _landmark(wall: Wall, eave: float, church: bool) -> None:
     else:
         wall.rect(middle - 0.07, y, middle + 0.07, y + 0.95, INK)  # the clock's hands
         wall.rect(middle, y - 0.07, middle + 0.7, y + 0.07, INK)
-        for ledge in (eave - 0.4, eave - 1.6, eave - 5.0):
-            wall.rect(0, ledge, wall.width, ledge + 0.3, tone(f.trim, 0.9))
+        wall.rect(0, eave - 0.4, wall.width, eave - 0.1, tone(f.trim, 0.9))

@@ -15,7 +15,7 @@ from PIL import Image, ImageChops, ImageDraw
 
 from shards.sources.miniature import cutouts, facade
 from shards.sources.miniature.camera import Camera, Point, faces, lay, normal, upright
-from shards.sources.miniature.facade import Wall
+from shards.sources.miniature.facade import Wall, masonry
 from shards.sources.miniature.place import Building, Place, make_place
 from shards.sources.miniature.plan import Photo
 from shards.sources.miniature.towns import RGB, tone
@@ -51,12 +51,12 @@ class Studio:
         shot.ground()
         steps = shot.things() + shot.traffic()
         for b, slopes in zip(self.place.buildings, self._roofs, strict=True):
-            x, z = min(max(camera.x, b.x0), b.x1) - camera.x, min(max(camera.z, b.z0), b.z1) - camera.z
-            if camera.sees(b.x0, b.z0, b.x1, b.z1):
-                steps.append((math.hypot(x, z) + 0.5, partial(self._house, shot, photo, b, slopes, math.hypot(x, z))))
+            away = math.hypot(*(min(max(c, a), z) - c for c, a, z in ((camera.x, b.x0, b.x1), (camera.z, b.z0, b.z1))))
+            steps.append((away + 0.5, partial(self._house, shot, photo, b, slopes, away)))
         for _, step in sorted(steps, key=lambda item: -item[0]):
             step()
-        shot.glow()
+        if photo.conditions.dark:
+            shot.glow()
         shot.air()
         return develop(shot.canvas, photo.conditions, rng)
 
@@ -94,11 +94,11 @@ def roof(b: Building) -> Slopes:
     for x, far, shade in rng.uniform((b.x0 + 0.4, 2.5, 0.7), (b.x1 - 1.2, 5, 1.1), (chimneys, 3)).tolist():
         stack = upright(x, b.z0 + far, x + 0.8, b.z0 + far, up - 0.5, up + rise * 0.8 + 1.3)
         found.append((stack, tone((150, 96, 80), shade)))
-    ridge, top = tone(b.family.roof_colour, 0.9), up + rise
+    ridge, top = tone(b.family.tiles, 0.9), up + rise
     if kind == "eaves":  # a hip: three slopes towards the street
         run = min(wide, deep) / 2
         x0, x1, z0, z1 = b.x0 + run, b.x1 - run, b.z0 + run, b.z1 - run
-        found.append(([(x0, top, z0), (x1, top, z0), (b.x1, up, b.z0), (b.x0, up, b.z0)], b.family.roof_colour))
+        found.append(([(x0, top, z0), (x1, top, z0), (b.x1, up, b.z0), (b.x0, up, b.z0)], b.family.tiles))
     elif kind in ("gable", "stepped") and b.fronts[0] == "south":  # a ridge away from the street
         x0, x1, z0, z1 = middle, middle, b.z0, b.z1
     else:
@@ -112,26 +112,15 @@ def roof(b: Building) -> Slopes:
 
 @lru_cache(maxsize=2)
 def clouds(seed: int) -> Image.Image:
-    """A 1024 x 256 mask of broken cloud."""
-    rng, total = np.random.default_rng(seed), np.zeros((256, 1024))
-    for cells, weight in ((6, 1.0), (14, 0.6), (40, 0.35), (110, 0.16)):
-        coarse = Image.fromarray(rng.normal(0, weight, (cells, cells * 2)).astype(np.float32))
-        total += np.asarray(coarse.resize((1024, 256), Image.Resampling.BICUBIC))
-    return Image.fromarray((np.clip(total * 0.75 - 0.1, 0, 1) * 255).astype(np.uint8))
-
-
-@lru_cache(maxsize=64)
-def gravel(width: int, height: int) -> Image.Image:
-    """RGB grain of the ground."""
-    grey = Image.fromarray(np.random.default_rng(5).normal(242, 7, (height, width)).clip(0, 255).astype(np.uint8))
-    return Image.merge("RGB", (grey, grey, grey))
+    """A 512 x 256 mask of broken cloud."""
+    cover = facade.blotches(np.random.default_rng(seed), (256, 512), {6: 1.0, 14: 0.6, 40: 0.35, 110: 0.16})
+    return Image.fromarray((np.clip(cover * 0.75 - 0.1, 0, 1) * 255).astype(np.uint8))
 
 
 @lru_cache(maxsize=2)
 def lamplight(power: float) -> Image.Image:
     """A 64 x 64 disc of warm light, fading outwards."""
-    y, x = np.mgrid[-1:1:64j, -1:1:64j]
-    fall = np.clip(1 - np.hypot(x, y), 0, 1)[..., None] ** 1.6
+    fall = np.clip(1 - np.hypot(*np.mgrid[-1:1:64j, -1:1:64j]), 0, 1)[..., None] ** 1.6
     return Image.fromarray((fall * 255 * power * np.array([1.0, 0.8, 0.5])).astype(np.uint8))
 
 
@@ -158,8 +147,8 @@ class Shot:
         column = Image.fromarray((zenith * (1 - t) + low * t).astype(np.uint8)[:, None, :])
         self.canvas.paste(column.resize((width, high), Image.Resampling.NEAREST), (0, 0))
         if sky.sky in ("clear", "overcast"):
-            x, y, which = self.rng.integers((300, 60, 2)).tolist()
-            part = clouds(which).crop((x, y, x + 640, y + 180)).resize((width, high), Image.Resampling.BILINEAR)
+            x, y, which = self.rng.integers((190, 76, 2)).tolist()
+            part = clouds(which).crop((x, y, x + 320, y + 180)).resize((width, high), Image.Resampling.BILINEAR)
             amount = float(self.rng.uniform(0, 0.75)) if sky.sky == "clear" else 0.5
             r, g, b = (low * 0.8 if sky.dark else low * 0.5 + (127, 126, 123)).astype(int).tolist()
             self.canvas.paste((r, g, b), (0, 0), part.point([int(v * amount) for v in range(256)]))
@@ -177,50 +166,41 @@ class Shot:
             colour = SNOW if self.conditions.snow else (104, 122, 100)
             self.polygon([*ridge, at(1.5, 600, 0), at(-1.5, 600, 0)], colour, 420, round=True)
         for bearing, wide, high, far in sorted(self.place.skyline, key=lambda s: -s[3]):
-            left, right, eaves = bearing - wide / 2 / far, bearing + wide / 2 / far, high * (0.7 if wide < 12 else 1.0)
-            shape = [
-                at(left, far, eaves),
-                at(bearing, far, high),
-                at(right, far, eaves),
-                at(right, far, 0),
-                at(left, far, 0),
-            ]
-            self.polygon(shape, ((112, 118, 130), (134, 126, 120), (92, 100, 112))[int(wide * 7) % 3], far, round=True)
+            half, eaves = wide / 2 / far, high * (0.7 if wide < 12 else 1.0)
+            corners = [(-half, 0.0), (-half, eaves), (0.0, high), (half, eaves), (half, 0.0)]
+            colour = ((112, 118, 130), (134, 126, 120), (92, 100, 112))[int(wide * 7) % 3]
+            self.polygon([at(bearing + turn, far, up) for turn, up in corners], colour, far, round=True)
 
-    def _strip(self, x0: float, x1: float, z0: float, z1: float, colour: RGB) -> None:
-        """A rectangle on the ground, in slices with more air the farther they lie."""
-        near = self.camera.z
+    def _strip(self, left: float, right: float, start: float, end: float, colour: RGB) -> None:
+        """A rectangle on the ground across and along the street, in slices with more air the farther they lie."""
+        (x0, z0), (x1, z1), near = self.place.spot(left, start), self.place.spot(right, end), self.camera.z
         for a, b in pairwise([z0, *[near + c for c in (6, 14, 26, 45, 80) if z0 < near + c < z1], z1]):
             self.polygon([(x0, 0, b), (x1, 0, b), (x1, 0, a), (x0, 0, a)], colour, max((a + b) / 2 - near, 0))
 
     def ground(self) -> None:
         """Pavement, road, kerb, markings; snow and rain change them."""
-        place, town, k, end = self.place, self.place.town, self.place.kerb, self.place.length
+        place, town, k, avenue = self.place, self.place.town, self.place.kerb, self.place.kind == "avenue"
         wet = 0.72 if self.conditions.sky == "rain" else 1.0
         paving, road, stone, paint = (tone(c, wet) for c in (town.paving, town.road, (176, 174, 168), town.marking))
         if self.conditions.snow:
             paving, road, stone, paint = (232, 236, 242), (176, 176, 178), (214, 216, 220), (190, 190, 190)
-        self._strip(-160, 160 + end, -20, 240 + end, paving)
-        if place.kind == "avenue":
-            self._strip(-k - 0.3, k + 0.3, -20, 120 + end, stone)
-            self._strip(-k, k, -20, 200 + end, road)
-            for z in np.arange(2, 84 + end, 6.0):
-                self._strip(-0.1, 0.1, z, z + 3, paint)
-            for at, n in [(at, n) for at in place.zebras for n in range(9)]:
-                x = -k + 0.5 + n * (2 * k - 1) / 9
-                self._strip(x, x + 0.5, at + 14, at + 17, paint)
-        else:
-            self._strip(-160, 160 + end, -k, k + 0.3, stone)
-            self._strip(-160, 160 + end, -k, k, road)
-            for x in np.arange(-36, 36 + end, 6.0):
-                self._strip(x, x + 3, 3.9, 4.1, paint)
-            for at, n in [(at, n) for at in place.zebras for n in range(9)]:
-                z = 1.5 + n * (k - 2) / 9
-                self._strip(at, at + 3, z, z + 0.5, paint)
-            for left, right in place.gaps:
-                self._strip(left + 1.5, right - 1.5, k - 0.2, 200, road)
+        start, end, middle, low = (
+            (-20, 240 + place.length, 0.0, 0.5 - k) if avenue else (-160, 160 + place.length, 4.0, 1.5)
+        )
+        self._strip(*((-160, 160) if avenue else (-20, 240)), start, end, paving)
+        self._strip(-k - 0.3, k + 0.3, start, end, stone)
+        self._strip(-k, k, start, end, road)
+        for along in np.arange(max(start, -38), 84 + place.length, 6.0).tolist():
+            self._strip(middle - 0.1, middle + 0.1, along, along + 3, paint)
+        for along, n in [(along, n) for along in place.zebras for n in range(9)]:
+            across = low + n * (k - 0.5 - low) / 9
+            self._strip(across, across + 0.5, along, along + 3, paint)
+        for left, right in place.gaps:
+            self._strip(k - 0.2, 200, left + 1.5, right - 1.5, road)
         under = self.canvas.crop((0, int(self.camera.horizon), *self.canvas.size))
-        self.canvas.paste(ImageChops.multiply(under, gravel(*under.size)), (0, int(self.camera.horizon)))
+        self.canvas.paste(
+            ImageChops.multiply(under, masonry("gravel").resize(under.size)), (0, int(self.camera.horizon))
+        )
 
     def lit(self, wall: Wall, facing: np.ndarray, distance: float, rng: np.random.Generator) -> Image.Image:
         """A wall's picture in the photo's light, with snow and lit windows."""
@@ -261,45 +241,38 @@ class Shot:
         steps, sky = [], self.conditions
         for t in self.place.things:
             tree = cutouts.tree(t.kind, sky.season, sky.snow, t.variant) if t.kind in cutouts.TREES else None
-            steps += self._stand(tree or cutouts.furniture(t.kind, t.variant), t.x, t.z, t.size)
+            steps += self._stand(tree or cutouts.thing(t.kind, t.variant), t.x, t.z, t.size)
         return steps
 
     def traffic(self) -> list[Step]:
         """Vehicles and people of the moment, around the photographer."""
         rng, place, camera, steps = self.rng, self.place, self.camera, []
+        avenue = place.kind == "avenue"
+        at, first, last = (camera.z, 9, 60) if avenue else (camera.x, -16, 16)
         for _ in range(int(rng.choice(5, p=[0.2, 0.3, 0.25, 0.15, 0.1]))):
-            kind, paint = str(rng.choice(list(cutouts.VEHICLES), p=[0.7, 0.2, 0.1])), int(rng.integers(8))
-            way, ahead, high = float(rng.choice([-1, 1])), float(rng.uniform(0, 1)), cutouts.VEHICLES[kind][1]
-            if place.kind == "avenue":
-                x, z = way * (1.8 + (place.kerb - 3.0) * float(rng.random())), camera.z + 12 + 58 * ahead
-                steps += self._stand(cutouts.vehicle(kind, paint, True), x, z, high)
-            else:
-                x, z = camera.x + 32 * ahead - 16, place.kerb - (1.4 if rng.random() < 0.6 else 4.2)
-                steps += self._stand(cutouts.vehicle(kind, paint, False), x, z, high, way)
-        for across, back, ahead, size in rng.uniform(
-            (-1, 0.8, 9, 1.6), (1, 3, 50, 1.85), (int(rng.integers(6)), 4)
-        ).tolist():
-            x, z = camera.x + 14 * across, place.front - back
-            if place.kind == "avenue":
-                x, z = math.copysign(z, across), camera.z + ahead
-            steps += self._stand(cutouts.person(int(rng.integers(40))), x, z, size)
+            kind, paint = str(rng.choice(["car", "van", "bus"], p=[0.7, 0.2, 0.1])), int(rng.integers(8))
+            way, along = float(rng.choice([-1, 1])), at + float(rng.uniform(first, last))
+            lane = way * (1.8 + (place.kerb - 3.0) * rng.random()) if avenue else place.kerb - rng.choice([1.4, 4.2])
+            x, z = place.spot(float(lane), along)
+            car, high = cutouts.thing("rear" if avenue else kind, paint), cutouts.THINGS[kind][1] / 100
+            steps += self._stand(car, x, z, high, 0.0 if avenue else way)
+        for along, back, size in rng.uniform((first, 0.8, 1.6), (last, 3, 1.85), (int(rng.integers(6)), 3)).tolist():
+            x, z = place.spot((place.front - back) * (float(rng.choice([-1, 1])) if avenue else 1), at + along)
+            steps += self._stand(cutouts.thing("person", int(rng.integers(8))), x, z, size)
         return steps
 
     def glow(self) -> None:
-        """After dark: pools of light about the street lamps, and the halo of everything bright."""
-        if not self.conditions.dark:
-            return
-        power = 1.0 if self.conditions.hour == "night" else 0.22
-        lamps = [t for t in self.place.things if t.kind == "lamp"]
-        for t, head in [(t, head) for t in lamps for head in (True, False)]:
-            u, v, depth = self.camera.project([(t.x, t.size - 0.4 if head else 0.05, t.z)])[0].tolist()
-            if 3 < depth < 40:
-                r = (5.5 if head else 4.0) * self.camera.focal / depth
-                u, v, flat = round(u / depth - r), round(v / depth), round(r if head else r * 0.3)
-                warm = lamplight(power).resize((2 * round(r), 2 * flat), Image.Resampling.BILINEAR)
-                under = self.canvas.crop((u, v - flat, u + warm.width, v - flat + warm.height))
+        """Light about the street lamps after dark, and the halo of everything bright."""
+        light = lamplight(1.0 if self.conditions.hour == "night" else 0.22)
+        for t in self.place.things:
+            u, v, depth = self.camera.project([(t.x, t.size - 0.4, t.z)])[0].tolist()
+            if t.kind == "lamp" and 3 < depth < 40:
+                r = round(5.5 * self.camera.focal / depth)
+                warm = light.resize((2 * r, 2 * r))
+                u, v = round(u / depth) - r, round(v / depth) - r
+                under = self.canvas.crop((u, v, u + 2 * r, v + 2 * r))
                 extra = ImageChops.multiply(under, warm)
-                self.canvas.paste(ImageChops.add(ImageChops.add(under, extra), extra), (u, v - flat))
+                self.canvas.paste(ImageChops.add(ImageChops.add(under, extra), extra), (u, v))
         bright = self.canvas.reduce(8).point([max(int((v - 150) * 1.1), 0) for v in range(256)] * 3)
         self.canvas.paste(ImageChops.add(self.canvas, bright.resize(self.canvas.size, Image.Resampling.BICUBIC)))
 

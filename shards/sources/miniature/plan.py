@@ -83,7 +83,7 @@ def _place(seed: int, split: str, index: int, a_street: int) -> PlacePhotos:
     north = 4203000.0 + apart * row + 900.0 * math.sin(column / 9.0 + town) + float(rng.uniform(-6, 6))
     heading = float(rng.uniform(0, 360))
     along = float(np.cumsum([0.0, *rng.uniform(*STEP, a_street - 1)])[at])
-    right, ahead = (0.0, along) if kind_of(identity, length) == "avenue" else (along, 0.0)
+    avenue = kind_of(identity, length) == "avenue"
     rng = np.random.default_rng([seed, 20, SPLITS[split], index])
     # ids have gaps; those of two towns pass 100,000, of which the file name keeps the last five digits
     place_id = (100000 if town % 2 else 0) + 3 * (number * a_street + at) + int(rng.integers(3))
@@ -98,22 +98,21 @@ def _place(seed: int, split: str, index: int, a_street: int) -> PlacePhotos:
         conditions = draw_conditions(rng, heading, purpose)
         x, z, y, yaw, zoom = rng.uniform((-reach, -2.2, 1.6, -turn, 0.66), (reach, 2.2, 2.6, turn, 0.84)).tolist()
         yaw += ((-0.24, -0.08, 0.08, 0.24)[view] if purpose == "database" else 0.0) - 0.025 * x  # a survey turns
-        x, z = x + right, z + ahead
+        x, z = (x, z + along) if avenue else (x + along, z)
         c, s = math.cos(math.radians(heading)), math.sin(math.radians(heading))
         utm, bearing = (east + x * c + z * s, north - x * s + z * c), int(heading + math.degrees(yaw))
-        date, pano = (int(rng.integers(*years)), int(rng.choice(SEASON_MONTHS[conditions.season]))), _pano(rng)
+        date, pano = (
+            (int(rng.integers(*years)), int(rng.choice(SEASON_MONTHS[conditions.season]))),
+            "".join(rng.choice(ALPHABET, 22)),
+        )
         if split == "train":
             bearing += 360 if rng.random() < 0.1 else 0  # raw, as in the original
-            file, line = _gsv_name(TOWNS[town].code, place_id, date, bearing, utm, pano)
+            file, line = _gsv_name(TOWNS[town].town, place_id, date, bearing, utm, pano)
             file += suffix
         else:
             file, line = f"eval/miniature/images/{split}/{purpose}/{utm_name(*utm, bearing, date, pano, view % 4)}", ""
         photos.append(Photo(file, line, key, conditions, x, z, y, yaw, zoom))
     return PlacePhotos(town, identity, length, tuple(photos))
-
-
-def _pano(rng: np.random.Generator) -> str:
-    return "".join(rng.choice(ALPHABET, 22))
 
 
 @cache

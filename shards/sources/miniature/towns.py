@@ -6,107 +6,92 @@ their arrangement and details tell them apart.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from typing import Any
 
 RGB = tuple[int, int, int]
+# colours in hexadecimal, sizes in metres, ranges as least-most; shops, railed: share of houses, of storeys
+FAMILIES = """
+town share walls                   pattern window  trim    accent  roof    tiles   width  floors storey bay shops railed
+HVN  0.4   #965442/#68423a/#80483c brick   sash    #e8e4d6 #2a4236 stepped #5c3c34 5.2-7  3-4    3      1.9 0.35  0
+HVN  0.3   #c4baa8/#a89684/#787e80 plaster sash    #f4f0e6 #3c4a62 gable   #6c4236 5-7.4  2-4    3      2   0.4   0
+HVN  0.2   #68423a/#b28462         brick   arch    #cec4b0 #462c28 eaves   #544642 8-13   2-3    3.2    2.3 0.3   0
+HVN  0.1   #bab6ae/#969c9e         panel   ribbon  #d2d4d4 #be6034 flat    #787878 11-16  3-5    3.1    2.6 0.3   0
+PAL  0.4   #e2b278/#e8ca96/#d68e68 plaster shutter #f0e4ce #467460 eaves   #b26042 6.5-10 2-4    3.1    2.4 0.35  0.25
+PAL  0.2   #eee6d6/#e6d6c4         plaster shutter #d8c6aa #3a6c9e flat    #c48262 6-9    2-3    3.1    2.3 0.3   0.35
+PAL  0.15  #cebc9e/#beaa8c         stone   arch    #e2d4ba #68422a eaves   #aa5c3e 8-12   2-3    3.5    2.7 0.4   0
+PAL  0.25  #dea096/#c4ccba         plaster french  #f6eee2 #78463c eaves   #b6684a 7-11   3-5    3      2.3 0.5   0.6
+GRM  0.45  #d8ccb4/#cec4b0/#e0d6c4 stone   french  #e8e0ce #3a3c42 mansard #68707c 10-15  4-5    3.1    2.2 0.6   0.7
+GRM  0.3   #c6baa4/#bcb2a2         stone   sash    #ded4c0 #4c423c mansard #5c626e 8-12   3-5    3.1    2.1 0.5   0.3
+GRM  0.15  #bc967a/#b0866c         brick   arch    #e0d4bc #34463e eaves   #62666e 9-13   3-4    3.3    2.4 0.4   0.2
+GRM  0.1   #9ea6ac/#b0b2b0         glass   curtain #788086 #363c42 flat    #6e6e70 12-18  4-6    3.3    1.6 0.3   0
+EGT  0.45  #985646/#884e42/#a87058 brick   sash    #c8beac #323032 flat    #5a5452 7-10   3-5    3.2    2   0.55  0
+EGT  0.2   #aaa49a/#8e8a86         panel   ribbon  #bcbcb8 #42546e flat    #606060 12-18  3-6    3.4    2.6 0.4   0
+EGT  0.15  #7a8c98/#687886/#8c9696 glass   curtain #5a646e #282c32 flat    #505458 13-20  4-7    3.6    1.7 0.35  0
+EGT  0.2   #cec6b2/#a4b2aa/#bea08c timber  sash    #f0f0e8 #5e3a32 gable   #565254 6.5-9  2-3    3      2.2 0.2   0
+"""
+# towers: at most so many far ones, the widest, the lowest and the highest of them; hills: share of places with a ridge
+GROUNDS = """
+town name       trees                paving  road    marking towers       hills
+HVN  Haverhaven round/poplar         #9e8e82 #625e5e #e2e0d6 9-30-18-55   0.25
+PAL  Portalba   cypress/round/poplar #c4b49c #7a746e #e8e6de 8-26-14-30   1
+GRM  Graumont   round/poplar         #b2aca2 #6a6866 #e6e6e2 9-30-18-55   0.25
+EGT  Eastgate   round/conifer        #a6a4a0 #58585a #deba46 16-34-30-120 0.25
+"""
 
 
 @dataclass(frozen=True)
 class Family:
-    """A kind of house: `walls` are its colours, sizes are in metres, `roof` and `pattern` name ways of drawing."""
+    """A kind of house, a row of `FAMILIES`; `pattern`, `window` and `roof` name ways of drawing."""
 
+    town: str
+    share: float
     walls: tuple[RGB, ...]
-    pattern: str  # brick, plaster, stone, panel, timber, glass
-    window: str  # sash, shutter, arch, ribbon, french, curtain
+    pattern: str
+    window: str
     trim: RGB
     accent: RGB  # shutters, doors, railings
-    roof: str  # flat, eaves, gable, stepped, mansard
-    roof_colour: RGB
+    roof: str
+    tiles: RGB
     width: tuple[float, float]
     floors: tuple[int, int]
     storey: float
-    bay: float  # distance between windows
-    shops: float  # share of houses with a shop
-    balconies: float = 0.0
+    bay: float  # between the middles of two windows
+    shops: float
+    railed: float
 
 
 @dataclass(frozen=True)
 class Town:
-    """A town's families (with their shares), its trees, ground and far view."""
+    """A row of `GROUNDS` and the town's families: what all its places share."""
 
+    town: str
     name: str
-    code: str
-    families: tuple[Family, ...]
-    shares: tuple[float, ...]
     trees: tuple[str, ...]
     paving: RGB
     road: RGB
-    skyline: tuple[int, int, int, int]  # most of its far towers, widest, lowest and highest of them in metres
-    hills: float  # share of places with hills behind
     marking: RGB
+    towers: tuple[int, int, int, int]
+    hills: float
+    families: list[Family]
 
 
-BRICK_RED, BRICK_DARK, BRICK_TAN = (150, 84, 66), (104, 66, 58), (178, 132, 98)
-HARBOUR = Town(
-    "Haverhaven", "HVN",
-    (
-        Family((BRICK_RED, BRICK_DARK, (128, 72, 60)), "brick", "sash",
-               (232, 228, 214), (42, 66, 54), "stepped", (92, 60, 52), (5.2, 7.0), (3, 4), 3.0, 1.9, 0.35),
-        Family(((196, 186, 168), (168, 150, 132), (120, 126, 128)), "plaster", "sash",
-               (244, 240, 230), (60, 74, 98), "gable", (108, 66, 54), (5.0, 7.4), (2, 4), 3.0, 2.0, 0.4),
-        Family((BRICK_DARK, BRICK_TAN), "brick", "arch",
-               (206, 196, 176), (70, 44, 40), "eaves", (84, 70, 66), (8.0, 13.0), (2, 3), 3.2, 2.3, 0.3),
-        Family(((186, 182, 174), (150, 156, 158)), "panel", "ribbon",
-               (210, 212, 212), (190, 96, 52), "flat", (120, 120, 120), (11.0, 16.0), (3, 5), 3.1, 2.6, 0.3),
-    ),
-    (0.4, 0.3, 0.2, 0.1), ("round", "poplar"), (158, 142, 130), (98, 94, 94), (9, 30, 18, 55), 0.25, (226, 224, 214),
-)  # fmt: skip
-COAST = Town(
-    "Portalba", "PAL",
-    (
-        Family(((226, 178, 120), (232, 202, 150), (214, 142, 104)), "plaster", "shutter",
-               (240, 228, 206), (70, 116, 96), "eaves", (178, 96, 66), (6.5, 10.0), (2, 4), 3.1, 2.4, 0.35, 0.25),
-        Family(((238, 230, 214), (230, 214, 196)), "plaster", "shutter",
-               (216, 198, 170), (58, 108, 158), "flat", (196, 130, 98), (6.0, 9.0), (2, 3), 3.1, 2.3, 0.3, 0.35),
-        Family(((206, 188, 158), (190, 170, 140)), "stone", "arch",
-               (226, 212, 186), (104, 66, 42), "eaves", (170, 92, 62), (8.0, 12.0), (2, 3), 3.5, 2.7, 0.4),
-        Family(((222, 160, 150), (196, 204, 186)), "plaster", "french",
-               (246, 238, 226), (120, 70, 60), "eaves", (182, 104, 74), (7.0, 11.0), (3, 5), 3.0, 2.3, 0.5, 0.6),
-    ),
-    (0.4, 0.2, 0.15, 0.25), ("cypress", "round", "poplar"), (196, 180, 156), (122, 116, 110),
-    (8, 26, 14, 30), 1.0, (232, 230, 222),
-)  # fmt: skip
-BOULEVARD = Town(
-    "Graumont", "GRM",
-    (
-        Family(((216, 204, 180), (206, 196, 176), (224, 214, 196)), "stone", "french",
-               (232, 224, 206), (58, 60, 66), "mansard", (104, 112, 124), (10.0, 15.0), (4, 5), 3.1, 2.2, 0.6, 0.7),
-        Family(((198, 186, 164), (188, 178, 162)), "stone", "sash",
-               (222, 212, 192), (76, 66, 60), "mansard", (92, 98, 110), (8.0, 12.0), (3, 5), 3.1, 2.1, 0.5, 0.3),
-        Family(((188, 150, 122), (176, 134, 108)), "brick", "arch",
-               (224, 212, 188), (52, 70, 62), "eaves", (98, 102, 110), (9.0, 13.0), (3, 4), 3.3, 2.4, 0.4, 0.2),
-        Family(((158, 166, 172), (176, 178, 176)), "glass", "curtain",
-               (120, 128, 134), (54, 60, 66), "flat", (110, 110, 112), (12.0, 18.0), (4, 6), 3.3, 1.6, 0.3),
-    ),
-    (0.45, 0.3, 0.15, 0.1), ("round", "poplar"), (178, 172, 162), (106, 104, 102), (9, 30, 18, 55), 0.25,
-    (230, 230, 226),
-)  # fmt: skip
-GRID = Town(
-    "Eastgate", "EGT",
-    (
-        Family(((152, 86, 70), (136, 78, 66), (168, 112, 88)), "brick", "sash",
-               (200, 190, 172), (50, 48, 50), "flat", (90, 84, 82), (7.0, 10.0), (3, 5), 3.2, 2.0, 0.55),
-        Family(((170, 164, 154), (142, 138, 134)), "panel", "ribbon",
-               (188, 188, 184), (66, 84, 110), "flat", (96, 96, 96), (12.0, 18.0), (3, 6), 3.4, 2.6, 0.4),
-        Family(((122, 140, 152), (104, 120, 134), (140, 150, 150)), "glass", "curtain",
-               (90, 100, 110), (40, 44, 50), "flat", (80, 84, 88), (13.0, 20.0), (4, 7), 3.6, 1.7, 0.35),
-        Family(((206, 198, 178), (164, 178, 170), (190, 160, 140)), "timber", "sash",
-               (240, 240, 232), (94, 58, 50), "gable", (86, 82, 84), (6.5, 9.0), (2, 3), 3.0, 2.2, 0.2),
-    ),
-    (0.45, 0.2, 0.15, 0.2), ("round", "conifer"), (166, 164, 160), (88, 88, 90), (16, 34, 30, 120), 0.25,
-    (222, 186, 70),
-)  # fmt: skip
-TOWNS = (HARBOUR, COAST, BOULEVARD, GRID)
+def _cell(text: str) -> Any:
+    if "/" in text or "-" in text:
+        return tuple(_cell(part) for part in re.split("[/-]", text))
+    if text[0] == "#":
+        return tuple(bytes.fromhex(text[1:]))
+    return (float(text) if "." in text else int(text)) if text[0].isdigit() else text
+
+
+def _rows(table: str) -> list[dict[str, Any]]:
+    head, *rows = (line.split() for line in table.strip().splitlines())
+    return [dict(zip(head, map(_cell, row), strict=True)) for row in rows]
+
+
+_FAMILIES = [Family(**row) for row in _rows(FAMILIES)]
+TOWNS = [Town(**row, families=[f for f in _FAMILIES if f.town == row["town"]]) for row in _rows(GROUNDS)]
 SIGNS = (
     "CAFE", "BAKERY", "BOOKS", "HOTEL", "PHARMACY", "FLOWERS", "MARKET", "BAR", "TAILOR", "OPTIC", "SHOES", "BANK",
     "RADIO", "FRUIT", "TOYS", "BIKES", "PAPER", "MUSIC", "DELI", "WINE", "FISH", "TEA", "PIZZA", "ART", "HAIR", "KEYS",

@@ -9,7 +9,7 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from PIL import Image
@@ -84,21 +84,21 @@ class Conditions:
             return np.asarray(ambient + 0.55 * sun)
         return np.asarray(ambient * (0.9 + 0.1 * float(normal[1])) + sun * max(0.0, float(normal @ self.to_sun)))
 
-    def veil(self, distance: float) -> float:
-        """Share of the air's own colour at this distance in metres."""
-        return 1.0 - math.exp(-SKIES[self.sky][1] * max(distance - 8.0, 0.0))
+    def _air(self, light: Array, distance: float) -> tuple[Array, Array]:
+        """[3] what a colour is multiplied with, then what is added, behind `distance` metres of air."""
+        veil = 1.0 - math.exp(-SKIES[self.sky][1] * max(distance - 8.0, 0.0))
+        return light * (1 - veil), self.colours[1] * 0.96 * veil
 
     def relight(self, picture: Image.Image, light: Array, distance: float) -> Image.Image:
-        """An RGB picture in this light behind `distance` metres of air."""
-        veil = self.veil(distance)
-        (r, g, b), (x, y, z) = (light * (1 - veil)).tolist(), (self.colours[1] * 0.96 * veil).tolist()
+        """An RGB picture in this light behind the air."""
+        (r, g, b), (x, y, z) = (part.tolist() for part in self._air(light, distance))
         return picture.convert("RGB", (r, 0, 0, x, 0, g, 0, y, 0, 0, b, z))
 
     def shade(self, colour: Sequence[float], light: Array, distance: float) -> RGB:
-        """One colour (0..255) in this light behind `distance` metres of air."""
-        veil = self.veil(distance)
-        r, g, b = np.clip(np.array(colour) * light * (1 - veil) + self.colours[1] * 0.96 * veil, 0, 255).tolist()
-        return int(r), int(g), int(b)
+        """One colour (0..255) in this light behind the air."""
+        gain, haze = self._air(light, distance)
+        r, g, b = np.clip(np.array(colour) * gain + haze, 0, 255).astype(int).tolist()
+        return r, g, b
 
 
 def draw_conditions(rng: np.random.Generator, heading: float, purpose: str) -> Conditions:
@@ -108,12 +108,6 @@ def draw_conditions(rng: np.random.Generator, heading: float, purpose: str) -> C
     if sky == "snowfall" and season != "winter":
         sky = "overcast"
     return Conditions(season, hour, sky, sky == "snowfall" or (season == "winter" and rng.random() < 0.6), heading)
-
-
-@lru_cache(maxsize=4)
-def _noise(width: int, height: int) -> np.ndarray:
-    """[2 * height, 2 * width, 3] unit normal noise, int8 in 1/32."""
-    return np.random.default_rng(99).normal(0, 32, (2 * height, 2 * width, 3)).clip(-127, 127).astype(np.int8)
 
 
 def develop(image: Image.Image, sky: Conditions, rng: np.random.Generator) -> bytes:
@@ -127,8 +121,7 @@ def develop(image: Image.Image, sky: Conditions, rng: np.random.Generator) -> by
     levels = np.where(levels > 205, 205 + (levels - 205) * 0.55, levels)  # a soft shoulder, as cameras have
     balance = np.array([[1.0 + rng.normal(0, 0.045)], [1.0], [1.0 + rng.normal(0, 0.05)]])
     image = image.point(np.clip(levels * balance, 0, 255).astype(int).ravel().tolist())
-    strength, (x, y) = float(rng.uniform(1.0, 3.5)) * (2.2 if night else 1.0), rng.integers(size).tolist()
-    grain = _noise(*size)[y : y + size[1], x : x + size[0]] * np.int16(round(strength * 8)) >> 8
+    grain = rng.standard_normal((size[1], size[0], 3), np.float32) * rng.uniform(1.0, 3.5) * (2.2 if night else 1.0)
     store = io.BytesIO()
     image = Image.fromarray((np.asarray(image) + grain).clip(0, 255).astype(np.uint8))
     image.save(store, "JPEG", quality=int(rng.integers(72, 93)))
