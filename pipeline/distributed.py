@@ -86,6 +86,31 @@ class _Sum(torch.autograd.Function):
         return grad
 
 
+_statistics_group: Any = None
+
+
+def open_statistics_group() -> None:
+    """Gives BatchNorm's small exchanges a process group of their own: in backward they then do not queue behind the
+    gradients that DDP reduces meanwhile. Without it they take the default group. Collective; once after the start."""
+    global _statistics_group
+    _statistics_group = dist.new_group() if is_distributed() else None
+
+
+@torch.no_grad()
+def gather_statistics(local: Tensor) -> Tensor:
+    """As `gather`, without gradient, in the group of `open_statistics_group`."""
+    gathered = local.new_empty((world_size() * local.shape[0], *local.shape[1:]))
+    _all_gather(gathered, local.contiguous(), group=_statistics_group)
+    return gathered
+
+
+@torch.no_grad()
+def sum_statistics(local: Tensor) -> Tensor:
+    """As `global_sum`, without gradient and into `local` itself, in the group of `open_statistics_group`."""
+    dist.all_reduce(local, op=dist.ReduceOp.SUM, group=_statistics_group)
+    return local
+
+
 def gather(local: Tensor) -> Tensor:
     """Rows of all ranks in rank order, with gradient: [b, ...] -> [B, ...]. All ranks hold the same b.
 

@@ -17,6 +17,7 @@ import torch
 from pipeline.common.errors import UsageError
 from pipeline.common.text import Table
 from pipeline.config import ModelConfig
+from pipeline.model.adapters import ConvAdapter
 from pipeline.model.backbones.transformer import Backbone
 from pipeline.model.batch_norm import GlobalBatchNorm2d
 from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
@@ -32,7 +33,7 @@ class StepSizes:
         images: b, on a rank.
         regions, dim, layers, feedforward: R, D and the cross-image encoder.
         tokens, depth: T and the backbone's blocks.
-        norms: channels of each BatchNorm.
+        norms: channels of each exchange of BatchNorm statistics: of an adapter's 1x1 paths, then of its wider ones.
         trained, total: parameters.
         key_bytes: of a gathered key or value: 4, or 2 under bf16 autocast.
         passes: descriptions of an image: 1, or 2 in joint training, of which the second needs no other image.
@@ -70,11 +71,21 @@ def step_sizes(model: PlaceModel, images: int, key_bytes: int = 4, passes: int =
         feedforward=encoder.feedforward,
         tokens=1 + model.backbone.grid**2,
         depth=model.backbone.depth,
-        norms=tuple(m.num_features for m in model.modules() if isinstance(m, GlobalBatchNorm2d)),
+        norms=_exchanges(model.backbone),
         trained=counts["trainable"],
         total=counts["total"],
         key_bytes=key_bytes,
         passes=passes,
+    )
+
+
+def _exchanges(backbone: Backbone) -> tuple[int, ...]:
+    """Channels of every group of BatchNorms that share an exchange."""
+    groups = [steps for a in backbone.adapters() if isinstance(a, ConvAdapter) for steps in a.steps()]
+    return tuple(
+        sum(step.conv.out_channels for step in steps)
+        for steps in groups
+        if steps and isinstance(steps[0].norm, GlobalBatchNorm2d)
     )
 
 

@@ -8,13 +8,15 @@ starts at zero: training starts from the released model's own output.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pipeline.common.errors import UsageError
 from pipeline.config import AdapterConfig
-from pipeline.model.batch_norm import GlobalBatchNorm2d
+from pipeline.model.batch_norm import GlobalBatchNorm2d, normalised_together
 
 NORM_EPS = 1e-3  # published: BatchNorm2d(eps=0.001)
 
@@ -35,16 +37,15 @@ class AdaptedMLP(nn.Module):
 
 
 class ConvNorm(nn.Module):
-    """Convolution of odd size -> normalisation -> ReLU, same height and width."""
+    """A convolution of odd size that keeps height and width, and the normalisation behind it.
+
+    Its adapter computes with them: parallel ones go together.
+    """
 
     def __init__(self, channels: int, out: int, kernel: int, norm: str) -> None:
         super().__init__()
         self.conv = nn.Conv2d(channels, out, kernel, padding=kernel // 2)
         self.norm = NORMS[norm](out)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """[b, channels, H, W] -> [b, out, H, W]."""
-        return torch.relu(self.norm(self.conv(x)))
 
 
 def _group_norm(channels: int) -> nn.GroupNorm:
@@ -76,10 +77,14 @@ class VanillaAdapter(nn.Module):
 class ConvAdapter(nn.Module):
     """Linear -> ReLU -> parallel convolution paths over the patch map, concatenated (+ skip) -> Linear.
 
+    Every path begins with a 1x1 convolution of the same map: together they are one product over tokens. At most one
+    wider convolution follows. A normalisation and a ReLU come after each convolution; BatchNorms that stand side by
+    side share their exchange between ranks. Maps lie in memory as tokens do, channels last.
+
     Args:
         dim: token width D.
         width: bottleneck width; the paths' output channels add up to it.
-        paths: for each path its convolutions as (output channels, kernel).
+        paths: for each path its convolutions as (output channels, kernel): a 1x1, and perhaps one more.
         skip: whether the input of the paths is added to their output.
         norm: "batch", "group" or "none".
         others: tokens that are no patches and skip the convolutions: the class token, and registers behind it.
@@ -97,12 +102,35 @@ class ConvAdapter(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """[b, others + G*G, D] -> [b, others + G*G, D]."""
         hidden = torch.relu(self.down(x))
+        first, second = self.steps()
+        weight = torch.cat([step.conv.weight.flatten(1) for step in first])
+        products = F.linear(hidden, weight, torch.cat([cast(Tensor, step.conv.bias) for step in first]))
         side = round((hidden.shape[1] - self.others) ** 0.5)
-        grid = hidden[:, self.others :].transpose(1, 2).unflatten(2, (side, side))  # [b, width, G, G]
-        maps = torch.cat([path(grid) for path in self.paths], dim=1)
-        mixed = torch.cat((hidden[:, : self.others], maps.flatten(2).transpose(1, 2).to(hidden.dtype)), dim=1)
+        grid = products[:, self.others :].contiguous().unflatten(1, (side, side)).permute(0, 3, 1, 2)
+        maps = _normalised(first, grid).split([step.conv.out_channels for step in first], dim=1)
+        ends = [part for part, path in zip(maps, self.paths, strict=True) if isinstance(path, ConvNorm)]
+        if second:
+            reduced = [part for part, path in zip(maps, self.paths, strict=True) if not isinstance(path, ConvNorm)]
+            wide = [step.conv(part) for step, part in zip(second, reduced, strict=True)]
+            ends.append(_normalised(second, torch.cat(wide, dim=1)))
+        patches = torch.cat([part.permute(0, 2, 3, 1).flatten(1, 2) for part in ends], dim=2)
+        mixed = torch.cat((hidden[:, : self.others], patches.to(hidden.dtype)), dim=1)
         out: Tensor = self.up(mixed + hidden if self.skip else mixed)
         return out
+
+    def steps(self) -> tuple[list[ConvNorm], list[ConvNorm]]:
+        """The 1x1 convolutions of all paths; those that follow one. Each list is computed, and normalised, together."""
+        convolutions = [[path] if isinstance(path, ConvNorm) else list(path) for path in self.paths]  # type: ignore[call-overload]
+        return [path[0] for path in convolutions], [path[1] for path in convolutions if len(path) > 1]
+
+
+def _normalised(steps: list[ConvNorm], x: Tensor) -> Tensor:
+    """The normalisation of each step over its channels of x [b, C, H, W], then ReLU."""
+    norms = [step.norm for step in steps]
+    if isinstance(norms[0], GlobalBatchNorm2d):
+        return torch.relu(normalised_together(cast(list[GlobalBatchNorm2d], norms), x))
+    parts = x.split([step.conv.out_channels for step in steps], dim=1)
+    return torch.relu(torch.cat([norm(part) for norm, part in zip(norms, parts, strict=True)], dim=1))
 
 
 def _path(width: int, convolutions: list[tuple[int, int]], norm: str) -> nn.Module:

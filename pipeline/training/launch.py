@@ -24,7 +24,7 @@ import torch
 import torch.distributed as dist
 
 from pipeline.common.errors import Interrupted, Preempted, UsageError, UserError
-from pipeline.distributed import is_distributed, lost
+from pipeline.distributed import is_distributed, lost, open_statistics_group
 
 ADVICE = "launch with: accelerate launch --config_file jobs/accelerate/<engine>.yaml -m jobs.train --config FILE"
 
@@ -76,6 +76,7 @@ def start(timeout: float) -> Any:
             f"{launched} processes were launched but this one is in a group of {accelerator.num_processes}; {ADVICE}"
         )
     _check_launcher(accelerator.num_processes)
+    open_statistics_group()
     if accelerator.is_main_process:
         on = accelerator.device.type + (f", {dist.get_backend()}" if is_distributed() else "")
         plural = "process" if launched == 1 else "processes"

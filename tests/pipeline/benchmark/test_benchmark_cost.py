@@ -25,7 +25,7 @@ SMALL = ModelConfig(
 )
 VIT_B = StepSizes(
     images=288, regions=14, dim=768, layers=2, feedforward=2048, tokens=257, depth=12,
-    norms=(192, 24, 96, 24, 96) * 12, trained=20_181_185, total=106_761_665,
+    norms=(240, 192) * 12, trained=20_181_185, total=106_761_665,
 )  # fmt: skip
 
 

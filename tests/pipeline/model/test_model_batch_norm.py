@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from processes import run_ranks
@@ -9,6 +11,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from pipeline.distributed import rank, world_size
+from pipeline.model import batch_norm
 from pipeline.model.batch_norm import GlobalBatchNorm2d
 
 CHANNELS = 5
@@ -77,6 +80,63 @@ def test_statistics_span_all_ranks(sizes: list[int], recompute: bool) -> None:
         for r in ranks:
             assert torch.allclose(r[name], truth[name], rtol=1e-12, atol=1e-12), name
             assert torch.equal(r[name], ranks[0][name]), name
+
+
+def torchs_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What torch's CUDA kernels compute, by their formulas in torch.nn.SyncBatchNorm, for tensors on the CPU."""
+
+    def column(values: Tensor) -> Tensor:
+        return values.view(1, -1, 1, 1)
+
+    def stats(x: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+        var, mean = torch.var_mean(x, (0, 2, 3), correction=0)
+        return mean, (var + eps).rsqrt()
+
+    def gather_stats(
+        x: Tensor, means: Tensor, inverses: Tensor, mean: Tensor, var: Tensor, momentum: float, eps: float, n: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        assert means.is_contiguous() and inverses.is_contiguous() and n.shape == (len(means),)
+        whole = (n[:, None] * means).sum(0) / n.sum()
+        square = (n[:, None] * (inverses**-2 - eps + (means - whole) ** 2)).sum(0)
+        mean.lerp_(whole, momentum)
+        var.lerp_(square / (n.sum() - 1), momentum)
+        return whole, (square / n.sum() + eps).rsqrt()
+
+    def elemt(x: Tensor, weight: Tensor, bias: Tensor, mean: Tensor, inverse: Tensor, eps: float) -> Tensor:
+        return (x - column(mean)) * column(inverse * weight) + column(bias)
+
+    def reduce(grad: Tensor, x: Tensor, mean: Tensor, inverse: Tensor, *_: Any) -> tuple[Tensor, ...]:
+        assert grad.stride() == x.stride()
+        total, product = grad.sum((0, 2, 3)), (grad * (x - column(mean))).sum((0, 2, 3))
+        return total, product, product * inverse, total
+
+    def backward(
+        grad: Tensor,
+        x: Tensor,
+        mean: Tensor,
+        inverse: Tensor,
+        weight: Tensor,
+        total: Tensor,
+        product: Tensor,
+        n: Tensor,
+    ) -> Tensor:
+        assert n.dtype == torch.int32
+        inner = grad - column(total / n.sum()) - (x - column(mean)) * column(inverse**2 * product / n.sum())
+        return inner * column(weight * inverse)
+
+    for name, kernel in {
+        "stats": stats, "gather_stats_with_counts": gather_stats, "elemt": elemt,
+        "backward_reduce": reduce, "backward_elemt": backward,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(torch, f"batch_norm_{name}", kernel)
+    monkeypatch.setattr(batch_norm, "_on_gpu", lambda x: True)
+
+
+@pytest.mark.parametrize("sizes", [[3, 3], [1, 4, 1]])
+def test_the_way_of_a_gpu_gives_the_same(sizes: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """How torch's kernels are put together, without a GPU; that they are what is written here, tests/gpu shows."""
+    torchs_kernels(monkeypatch)
+    test_statistics_span_all_ranks(sizes, False)
 
 
 def in_half_precision() -> tuple[Tensor, Tensor]:

@@ -16,6 +16,11 @@ from pipeline.model.backbones.transformer import Backbone, resize_positions
 from pipeline.model.pooling import Pooling, cell_edges
 
 
+@pytest.fixture(autouse=True)
+def same_draws() -> None:
+    torch.manual_seed(0)
+
+
 @pytest.mark.parametrize(
     ("grid", "cells", "edges"),
     [(16, 1, [0, 16]), (16, 2, [0, 8, 16]), (16, 3, [0, 5, 11, 16]), (23, 2, [0, 12, 23]), (23, 3, [0, 8, 15, 23])],
@@ -73,8 +78,10 @@ def test_pooling_refuses_more_cells_than_tokens() -> None:
 
 def stirred(config: AdapterConfig, dim: int = 16) -> ConvAdapter:
     adapter = build_adapter(config, dim).double()
-    for parameter in adapter.parameters():
+    for name, parameter in adapter.named_parameters():
         torch.nn.init.normal_(parameter, std=0.3)
+        if name.endswith("conv.bias"):  # else now and then all ReLUs of a narrow path are at zero
+            parameter.data.abs_().add_(1.0)
     assert isinstance(adapter, ConvAdapter)
     return adapter
 
@@ -95,6 +102,43 @@ def test_adapter_kernels_and_skip(kind: str, reach: int, times: int) -> None:
     assert far == reach
     hidden = torch.relu(adapter.down(x[:, 0]))
     assert torch.allclose(adapter(x)[:, 0], adapter.up(times * hidden), atol=1e-12)
+
+
+def path_by_path(adapter: ConvAdapter, x: Tensor) -> Tensor:
+    """The definition: each convolution, its norm and a ReLU by themselves, in torch's own modules."""
+    hidden = torch.relu(adapter.down(x))
+    side = round((x.shape[1] - 1) ** 0.5)
+    ends = []
+    for path in adapter.paths:
+        grid = hidden[:, 1:].transpose(1, 2).unflatten(2, (side, side))
+        for step in path if isinstance(path, torch.nn.Sequential) else [path]:
+            grid = torch.relu(step.norm(step.conv(grid)))  # type: ignore[operator, union-attr]
+        ends.append(grid.flatten(2).transpose(1, 2))
+    mixed = torch.cat((hidden[:, :1], torch.cat(ends, 2)), 1)
+    out: Tensor = adapter.up(mixed + hidden if adapter.skip else mixed)
+    return out
+
+
+@pytest.mark.parametrize("train", [True, False])
+@pytest.mark.parametrize("norm", ["batch", "group", "none"])
+@pytest.mark.parametrize("kind", ["mulconv", "conv", "conv1x1", "conv3x3", "conv5x5"])
+def test_adapter_is_its_paths_one_by_one(kind: str, norm: str, train: bool) -> None:
+    """Output, gradients and running buffers, though convolutions and norms side by side are computed together."""
+    adapter = stirred(AdapterConfig(kind=kind, norm=norm, reduced=3)).train(train)  # type: ignore[arg-type]
+    x = torch.randn(3, 1 + 25, 16, dtype=torch.float64)
+    start = {name: value.clone() for name, value in adapter.state_dict().items()}
+    found = []
+    for run in (adapter, lambda x: path_by_path(adapter, x)):
+        adapter.load_state_dict(start)
+        adapter.zero_grad()
+        asked = x.clone().requires_grad_()
+        out = run(asked)
+        (out**2).sum().backward()
+        gradients = {name: p.grad.clone() for name, p in adapter.named_parameters() if p.grad is not None}
+        found.append(gradients | {"out": out.detach(), "x": asked.grad})
+        found[-1] |= {f"buffer {name}": value.clone() for name, value in adapter.named_buffers()}
+    for name, value in found[1].items():
+        assert torch.allclose(found[0][name], value, rtol=1e-9, atol=1e-9), name
 
 
 @pytest.mark.parametrize("norm", ["batch", "group", "none"])
