@@ -195,6 +195,12 @@ class TrainConfig(Settings):
     per-image part then does not grow with the batch for adapter.norm group or none; for batch it grows more slowly."""
     compile: bool = setting(False, changes="speed")
     """Compile the backbone's blocks (torch.compile): one process or DDP, without encode_chunk; not in validation."""
+    tf32: bool = setting(False, changes="numbers")
+    """On a GPU, compute float32 products and convolutions with TF32's 10 bits: faster; validation stays in float32.
+    Parts that accelerate's bf16 or fp16 computes are not concerned."""
+    deterministic: bool = setting(False, changes="speed")
+    """On a GPU, only deterministic kernels, so that the same run gives the same bits; slower. An operation that has
+    none ends the run."""
     engine: Literal["auto", "ddp", "fsdp2"] = setting("auto", changes="speed")
     """auto: the engine that accelerate was launched with (DDP, DeepSpeed); fsdp2 shards parameters (fully_shard)."""
     save_every: int = setting(200, changes="none", at_least=1)

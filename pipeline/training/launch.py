@@ -62,6 +62,7 @@ def start(timeout: float) -> Any:
     # the statistics of GlobalBatchNorm are the same on all ranks already: broadcasting them would only cost
     ddp = DistributedDataParallelKwargs(broadcast_buffers=False, gradient_as_bucket_view=True)
     _watch_launcher()
+    torch.backends.cudnn.allow_tf32 = False  # as torch's matrix products; a training may ask for it (`numerics`)
     accelerator = Accelerator(
         cpu=not cuda and not deepspeed,  # without it two launched CPU processes are two independent copies
         kwargs_handlers=[waiting, ddp],

@@ -31,10 +31,15 @@ def learning_rate(config: TrainConfig, step: int, steps_per_epoch: int, total_st
     return config.lr * warmup * factor
 
 
-def build_optimizer(config: TrainConfig, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
-    """The configured optimiser over the trainable parameters; plain SGD has no momentum."""
+def build_optimizer(
+    config: TrainConfig, parameters: Iterable[nn.Parameter], fused: bool = False
+) -> torch.optim.Optimizer:
+    """The configured optimiser over the trainable parameters; plain SGD has no momentum.
+
+    `fused`: Adam in one kernel for all parameters, on a GPU and where no engine shards them.
+    """
     trainable = [p for p in parameters if p.requires_grad]
     if config.optimizer == "sgd":
         return torch.optim.SGD(trainable, lr=config.lr, weight_decay=config.weight_decay)
     kind = torch.optim.AdamW if config.optimizer == "adamw" else torch.optim.Adam
-    return kind(trainable, lr=config.lr, weight_decay=config.weight_decay)
+    return kind(trainable, lr=config.lr, weight_decay=config.weight_decay, fused=fused or None)

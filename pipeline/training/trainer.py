@@ -50,6 +50,7 @@ from pipeline.training.launch import notice_of, stop_at, stop_signals
 from pipeline.training.loss import MultiSimilarityLoss
 from pipeline.training.meter import Meter
 from pipeline.training.mining import Mining
+from pipeline.training.numerics import full_float32, set_numerics
 from pipeline.training.run_folder import working_in
 from pipeline.training.run_log import RunLog
 from pipeline.training.schedule import build_optimizer, learning_rate
@@ -112,6 +113,9 @@ class Trainer:
         self.stops: list[int] = []  # signals received
         self.problem: Exception | None = None  # met between two exchanges of the ranks, told in the next
 
+        if (numerics := set_numerics(config.train, accelerator.device)) and self.main:
+            print(numerics, file=sys.stderr, flush=True)
+
         # what all ranks must agree on before they build anything
         self.index = agreed(lambda: open_shards(config.data), what=f"reading {config.data.shards}")
         same(settings_digest(config), "the digest of the settings")
@@ -135,12 +139,14 @@ class Trainer:
             initialise(model, self.index, config, accelerator.device)
 
         # compiled, then wrapped by the engine, which takes the optimiser's tensors last
-        compile_backbone(model, config, choose(config.train.engine), accelerator.device)
+        chosen = choose(config.train.engine)
+        compile_backbone(model, config, chosen, accelerator.device)
+        fused = chosen == "ddp" and accelerator.device.type == "cuda"
         self.engine: Engine = build_engine(
             config.train,
             accelerator,
             model,
-            lambda parameters: build_optimizer(config.train, parameters),
+            lambda parameters: build_optimizer(config.train, parameters, fused),
             4 * config.data.places_per_batch // world_size(),
         )
         self.engine.load(optimizer, self.state.scaler)
@@ -334,7 +340,7 @@ class Trainer:
     @contextmanager
     def _whole(self) -> Iterator[PlaceModel]:
         """The model as it is, whole and in evaluation mode, with a bank of its own, which the next save writes."""
-        with self.engine.plain() as model, uncompiled(self.config.train.compile):
+        with self.engine.plain() as model, uncompiled(self.config.train.compile), full_float32():
             model.bank = self.training_bank.encode(model)
             self.bank = (self.state.step, model.bank)
             yield model
