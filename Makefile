@@ -16,7 +16,7 @@ test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --timeout 3600
 
 test-gpu: $(STAMP)
-	$(BIN)/python -m pytest -m gpu
+	$(BIN)/python -m pytest tests/gpu -m "gpu or not gpu"
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

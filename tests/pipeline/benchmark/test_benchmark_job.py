@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 import torch
 from processes import run_ranks
 
@@ -81,14 +80,6 @@ def test_ratios_are_taken_within_a_round() -> None:
     assert "".join(calls) == "abc" + "abc" + "cba"
     shown = timing.show([comparison])
     assert "2.00 (2.00-2.00)" in shown
-
-
-@pytest.mark.gpu
-def test_the_step_on_a_gpu() -> None:
-    from pipeline.benchmark import step
-
-    found = step.measure(SIZES["tiny"], torch.device("cuda"), 2, 8, full=False)
-    assert all(row.seconds > 0 for comparison in found for row in comparison.rows)
 
 
 def test_planning_mined_batches_is_measured(tmp_path: Path) -> None:
