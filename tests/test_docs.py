@@ -40,6 +40,7 @@ ELSEWHERE = {
     "python -m jobs.evaluate --checkpoint CricaVPR.pth": "it needs the authors' file",
     "python -m jobs.weights": "tests/jobs/test_job_weights_figures.py",
     "python -m jobs.figures": "tests/jobs/test_job_weights_figures.py",
+    "python -m pytest tests/gpu": "it needs a GPU",
 }  # fmt: skip
 # what makes a command small, by the job (and part) it starts; later options win
 SMALL = {
