@@ -231,7 +231,7 @@ def _pairs(kind: type, argv: Sequence[str], hints: Mapping[str, Any]) -> list[tu
     while words:
         word = words.pop(0)
         if not word.startswith("--"):
-            raise UsageError(f"'{shown(word)}' stands without an option; write --NAME {shown(word)}")
+            raise UsageError(f"'{shown(word)}' is not an option; write --NAME {shown(word)}")
         name, equals, value = word[2:].partition("=")
         name = present_name(kind, name.replace("-", "_"))
         if name not in hints:

@@ -142,9 +142,9 @@ def _completed(rule: WriteRule, catalogue: Catalogue) -> WriteRule:
     if not 1 <= rule.rounds <= schema.MAX_ROUNDS:
         raise UsageError(f"--rounds {rule.rounds}: give 1 to {schema.MAX_ROUNDS}")
     if not 0 <= rule.max_bad <= 1:
-        raise UsageError(f"--max-bad {rule.max_bad}: a share between 0 and 1")
+        raise UsageError(f"--max_bad {rule.max_bad}: a share between 0 and 1")
     if rule.shard_mb <= 0 or rule.workers < 0 or rule.image.resize < 0:
-        raise UsageError("--shard-mb must be above 0, --workers and --resize not below 0")
+        raise UsageError("--shard_mb must be above 0, --workers and --resize not below 0")
     image = ImageRule(rule.image.check, rule.image.resize, catalogue.kind != "gsv_cities")
     return WriteRule(rule.rounds, rule.seed, float(rule.shard_mb), image, rule.reading, rule.max_bad, rule.workers)
 
@@ -346,8 +346,8 @@ def _refuse(out: Path, catalogue: Catalogue, left_out: list[LeftOut], max_bad: f
     write_atomically(out / schema.REPORT, report.report_bytes(left_out))
     n, of = len(left_out), catalogue.images
     why = ", ".join(f"{count:,} {reason}" for reason, count in report.reasons(left_out).items())
-    kept = "; a higher --max-bad continues with the shards written, mended files need --overwrite" if began else ""
+    kept = "; a higher --max_bad continues with the shards written, repaired files need --overwrite" if began else ""
     raise DataError(
         f"{out}/{schema.REPORT}: {n:,} of {of:,} images cannot be used ({why}), {100 * n / of:.2f} % and over "
-        f"--max-bad {max_bad:g}; mend them or raise --max-bad{kept}"
+        f"--max_bad {max_bad:g}; repair them or raise --max_bad{kept}"
     )

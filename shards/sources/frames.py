@@ -69,7 +69,7 @@ def numbers(table: pa.Table, name: str, path: Path, least: float, most: float) -
     if len(wrong):
         value = shown(column[int(wrong[0])].as_py(), 60)
         told = f"row {int(wrong[0]) + 1}: {name} is '{value}', not a number from {least:,.10g} to {most:,.10g}"
-        raise DataError(f"{shown(path)}: {told}; mend or remove the row")
+        raise DataError(f"{shown(path)}: {told}; correct or remove the row")
     return np.asarray(values, np.float64)
 
 
@@ -80,7 +80,7 @@ def whole_numbers(table: pa.Table, name: str, path: Path, least: int, most: int)
     if len(wrong):
         value = shown(table[name][int(wrong[0])].as_py(), 60)
         told = f"row {int(wrong[0]) + 1}: {name} is '{value}', not a whole number"
-        raise DataError(f"{shown(path)}: {told}; mend or remove the row")
+        raise DataError(f"{shown(path)}: {told}; correct or remove the row")
     return values.astype(np.int64)
 
 

@@ -76,7 +76,7 @@ def read(root: Path, cities: Sequence[str] = ()) -> Catalogue:
             rows = rows.filter(pc.is_in(rows["city_id"], pa.array(list(cities), pa.string())))
         tables.append(_find_files(layout.images, frame, rows, files))
     if unknown := sorted(set(cities) - known):
-        raise UsageError(f"--cities: {', '.join(unknown)} in no data frame; there are {', '.join(sorted(known))}")
+        raise UsageError(f"--cities: {', '.join(unknown)} not in any data frame; there are {', '.join(sorted(known))}")
     table = pa.concat_tables(tables)
     return build("gsv_cities", root, table, unlisted=_unlisted(layout.images, table, cities))
 
@@ -87,7 +87,7 @@ def _check_cities(column: pa.ChunkedArray, frame: Path) -> None:
         if city in ("", ".", "..") or len(city) > 100 or not city.isprintable() or re.search(r"[/\\]", city):
             row = column.to_pylist().index(city) + 1
             told = f"row {row}: city_id is '{shown(city, 60)}', not the plain name of a folder in Images/"
-            raise DataError(f"{shown(frame)}: {told}; mend or remove the row")
+            raise DataError(f"{shown(frame)}: {told}; correct or remove the row")
 
 
 def _find_files(

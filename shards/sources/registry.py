@@ -44,7 +44,7 @@ class SourceRule:
         cell_m = cell_m if self.cell_m is None else self.cell_m
         heading_deg = heading_deg if self.heading_deg is None else self.heading_deg
         if not 0.01 <= cell_m <= 1e6 or not 0 <= heading_deg <= 360:
-            raise UsageError(f"--cell-m {cell_m}: give 0.01 to 1,000,000; --heading-deg {heading_deg}: give 0 to 360")
+            raise UsageError(f"--cell_m {cell_m}: give 0.01 to 1,000,000; --heading_deg {heading_deg}: give 0 to 360")
         return cell_m, heading_deg
 
 

@@ -61,7 +61,7 @@ def read_utm(root: Path, cell_m: float = 10.0, heading_deg: float = 30.0) -> Cat
         heading_deg: width of a place's heading sector in degrees; 0 puts all headings together.
 
     Raises:
-        DataError: there is no photo; the names hold degrees where metres are due.
+        DataError: there is no photo; the names hold degrees where metres are expected.
     """
     left_out: list[LeftOut] = []
     named: list[tuple[str, int, list[str], float, float]] = []
@@ -141,7 +141,7 @@ def _refuse_degrees(root: Path, named: Sequence[tuple[str, float, float]]) -> No
     if named and all(abs(east) <= 180 and abs(north) <= 180 for _, east, north in named):
         path, east, north = named[0]
         raise DataError(
-            f"{shown(root)}: names hold degrees where UTM metres are due, such as @{east:g}@{north:g}@ in "
+            f"{shown(root)}: names hold degrees where UTM metres are expected, such as @{east:g}@{north:g}@ in "
             f"{shown(path)}; rename the photos to @UTM_east@UTM_north@..., or give --kind folders"
         )
 

@@ -96,7 +96,7 @@ def test_help_has_groups_examples_as_lines_and_no_types_of_python(capsys: pytest
 def test_a_wrong_option_is_told_before_wrong_data() -> None:
     with pytest.raises(UsageError, match="no option --train"):
         parse(RunConfig, "", ["--config", "nowhere.yaml", "--train.lrr", "1"])
-    with pytest.raises(UsageError, match="'outputs/run' stands without an option"):
+    with pytest.raises(UsageError, match="'outputs/run' is not an option"):
         parse(EvaluationConfig, "", ["--split", "val", "outputs/run"])
 
 

@@ -136,7 +136,9 @@ def test_sf_xls_names_are_read_with_their_heading_and_month(tmp_path: Path) -> N
 
 def test_degrees_in_the_place_of_metres_are_refused(tmp_path: Path) -> None:
     put(tmp_path, *(f"@-122.5089{i}@37.75645@10@S@37.7@-122.5@p@@{i}@@@@@@.jpg" for i in range(4)))
-    with pytest.raises(DataError, match=r"degrees where UTM metres are due, such as @-122\.509@37\.7565@ in @-122"):
+    with pytest.raises(
+        DataError, match=r"degrees where UTM metres are expected, such as @-122\.509@37\.7565@ in @-122"
+    ):
         read_source(tmp_path)
 
 

@@ -239,7 +239,7 @@ def test_too_many_bad_images_end_the_run_without_a_manifest(gsv: Gsv, tmp_path: 
     source, out = gsv(CITIES), tmp_path / "out"
     spoil(source)  # 5 of 79; 2 of them seen in the listing
     rule = WriteRule(rounds=1, max_bad=0.05, workers=1)
-    with pytest.raises(DataError, match=r"report.csv: 5 of 79 images .* 6\.33 % and over --max-bad 0\.05"):
+    with pytest.raises(DataError, match=r"report.csv: 5 of 79 images .* 6\.33 % and over --max_bad 0\.05"):
         write_shards(read_source(source), out, rule)
     assert not (out / schema.MANIFEST).exists() and not (out / schema.INDEX).exists()
     assert len((out / schema.REPORT).read_text().splitlines()) == 6
