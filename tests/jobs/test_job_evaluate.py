@@ -79,7 +79,7 @@ def test_one_process_and_two_write_the_same_figures(run_folder: Path) -> None:
     assert results["model"]["backbone"]["dim"] == 16 and len(results["fingerprint"]) == 16
     assert (out / "report.html").stat().st_size > 50_000 and (out / "figures" / "aisle.curves.png").is_file()
     assert (out / "descriptors/aisle/single_56px/database/part-00000.parquet").is_file()
-    kept = sorted((run_folder / "run/checkpoints/best").glob("pca-6.aisle.*.safetensors"))
+    kept = sorted((run_folder / "run/checkpoints/best").glob("pca.aisle.*.safetensors"))
     assert len(kept) == 3
     changed = [f.stat().st_mtime_ns for f in kept]
 
