@@ -2,6 +2,7 @@
 
     python -m jobs.locate --checkpoint outputs/RUN --build PHOTOS --index my-index
     python -m jobs.locate --checkpoint outputs/RUN --index my-index --photos A.jpg trip/ "b/*.jpg" drive.mp4
+    python -m jobs.locate --checkpoint outputs/RUN --index my-index --serve
 
 PHOTOS are folders (positions from names, `@UTM_east@UTM_north@`, or from EXIF GPS) or manifests: .csv or .parquet with
 `image` and, if known, `lat` and `lon` or `utm_east` and `utm_north`. Building again describes only what is new: the
@@ -24,7 +25,7 @@ from pipeline.common.errors import UsageError
 from pipeline.common.files import check_writable
 
 if TYPE_CHECKING:
-    from pipeline.locate.answers import Answer
+    from pipeline.locate.answers import Answer, Locator
     from pipeline.locate.no_match import Calibration
     from pipeline.locate.photo_index import PhotoIndex
 
@@ -81,6 +82,10 @@ class LocateJob:
     """auto (a GPU where there is one), cpu, cuda, cuda:1 ..."""
     figures: bool = True
     """Draw answers.jpg."""
+    serve: bool = False
+    """Answer on a local page (http://127.0.0.1:PORT, from this machine alone) until Ctrl-C."""
+    port: int = 8765
+    """Of the page; 0 takes a free one."""
 
 
 def main() -> None:
@@ -89,8 +94,12 @@ def main() -> None:
     for name, example in (("checkpoint", "outputs/cricavpr"), ("index", "my-index")):
         if not getattr(job, name):
             raise UsageError(f"--{name} is missing: for example --{name} {example}")
-    if not job.build and not job.photos:
-        raise UsageError("nothing to do: give --photos to be located, or --build PHOTOS to make the index")
+    if not job.build and not job.photos and not job.serve:
+        raise UsageError(
+            "nothing to do: give --photos to be located, --serve for a local page, or --build PHOTOS to make the index"
+        )
+    if not 0 <= job.port < 65536:
+        raise UsageError(f"--port is {job.port}; it must be 0 to 65535")
     if job.answers < 1:
         raise UsageError(f"--answers is {job.answers}; it must be at least 1")
     if job.batch is not None and job.batch < 1:
@@ -125,7 +134,7 @@ def run(job: LocateJob) -> None:
 
     from pipeline.config import EvaluationConfig
     from pipeline.evaluation.identity import model_digest
-    from pipeline.locate.answers import locate
+    from pipeline.locate.answers import Locator, locate
     from pipeline.locate.asked import asked_photos
     from pipeline.locate.exports import check_format
     from pipeline.locate.no_match import Apart
@@ -169,6 +178,17 @@ def run(job: LocateJob) -> None:
         index = open_index(folder, fingerprint)
     if photos:
         tell(job, index, locate(model, index, photos, job.answers, device, radius=job.radius))
+    if job.serve:
+        serve(Locator(model, index, device, job.radius), job)
+
+
+def serve(locator: Locator, job: LocateJob) -> None:
+    """Answers on a local page until Ctrl-C."""
+    from pipeline.locate.server import listen
+
+    server = listen(locator, job.answers, job.port)
+    print(f"http://127.0.0.1:{server.server_port} answers, from this machine alone; Ctrl-C ends it", flush=True)
+    server.serve_forever()  # Werkzeug takes Ctrl-C as the end that it is here, and closes: exit code 0
 
 
 def output_of(job: LocateJob) -> Path:

@@ -38,6 +38,8 @@ ELSEWHERE = {
         "tests/pipeline/training/test_training_nodes.py",
     "accelerate launch --mixed_precision bf16 ...": "tests/pipeline/training/test_training_precision.py",
     "python -m jobs.evaluate --checkpoint CricaVPR.pth": "it needs the authors' file",
+    "python -m jobs.locate --checkpoint outputs/cricavpr --index outputs/my_index --serve":
+        "tests/jobs/test_job_locate.py",
     "python -m jobs.weights": "tests/jobs/test_job_weights_figures.py",
     "python -m jobs.figures": "tests/jobs/test_job_weights_figures.py",
     "python -m pytest tests/gpu": "it needs a GPU",

@@ -51,6 +51,8 @@ LATE = (
     "pyproj",
     "rich",
     "jinja2",
+    "flask",
+    "werkzeug",
 )
 
 

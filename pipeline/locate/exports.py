@@ -166,7 +166,7 @@ def _metre(value: float | str) -> str:
 
 def label(found: Found) -> str:
     """Two lines below and above an answer in a picture: distance and confidence; where it is."""
-    sure = "" if found.confidence is None else f" · {100 * found.confidence:.0f} % sure"
+    sure = "" if found.confidence is None else f" · {100 * found.confidence:.0f} %"
     away = "" if found.metres is None else f"{found.metres:,.0f} m away"
     where = away or (", ".join(_degrees(found.degrees)) if found.degrees else "")
     if not where and found.utm:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
+import signal
+import time
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -142,6 +146,19 @@ def test_a_broken_photo_of_the_folder_is_named_and_nothing_is_left(
         open_index(tmp_path / "index", "f")
     with pytest.raises(UsageError, match="needs at least as many"):
         make_index(model, home / "plain", tmp_path / "index", EvaluationConfig(workers=0, pca=12), "cpu", "f")
+
+
+def test_a_page_until_interrupted(home: Path, model: PlaceModel, tmp_path: Path) -> None:
+    make_index(model, home / "plain", tmp_path / "index", CONFIG, "cpu", model_digest(model), progress=False)
+    options = ["--checkpoint", str(home / "run"), "--index", str(tmp_path / "index"), "--serve", "--port", "0"]
+    job, deadline = JobProcess("jobs.locate", options, tmp_path / "job.log"), time.monotonic() + 60
+    while not (address := re.search(r"http://127\.0\.0\.1:\d+", job.text())):
+        assert job.alive() and time.monotonic() < deadline, job.text()
+        time.sleep(0.05)
+    with urllib.request.urlopen(address[0], timeout=60) as answer:
+        assert answer.status == 200 and b"11 photos in index" in answer.read()
+    job.send(signal.SIGINT)
+    assert job.wait() == 0 and "Traceback" not in job.text()
 
 
 def test_names_of_photos_may_hold_anything() -> None:

@@ -255,6 +255,19 @@ def recall_curves(curves: Mapping[str, np.ndarray], path: Path, title: str, belo
         axes.legend(loc="lower right")
 
 
+def precision_recall_curves(curves: Mapping[str, tuple[np.ndarray, np.ndarray, str]], path: Path, below: str) -> None:
+    """Precision over recall, one line a protocol: name -> (precision [t], recall [t] in 0 ... 1, a note)."""
+    with canvas(7.4, 4.8, path) as figure:
+        axes = figure.subplots()
+        for number, (name, (precision, recall, note)) in enumerate(curves.items()):
+            axes.step(100 * recall, 100 * precision, where="post", color=CURVES[number % len(CURVES)], lw=1.8,
+                      ls=("-", "--", "-.", ":")[number % 4], label=f"{name}   {note}")  # fmt: skip
+        axes.set(xlabel="Recall  (% of the queries that have a right answer)", ylabel="Precision  (%)")
+        axes.set(xlim=(-1, 101), ylim=(-1, 102))
+        heading(axes, "First answers accepted up to a distance", below)
+        axes.legend(loc="lower left")
+
+
 def collapse(curves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Curves that are the same number for number, under their names joined by "="."""
     names: dict[tuple[float, ...], list[str]] = {}

@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.evaluation.evaluate import Result
 from pipeline.evaluation.report import figures
 from pipeline.evaluation.report.error_plots import error_plot
+from pipeline.evaluation.report.precision import first_answers, precision_recall, summary
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 GRIDS: tuple[tuple[figures.Kind, str], ...] = (
@@ -56,6 +57,9 @@ def draw(
             below = f"{name} · {scored[0].queries:,} queries in {scored[0].database:,} images · {evaluated.rule}"
             figures.recall_curves(curves, path, "Recall@N by protocol", below, asked)
             drawn.append(Picture(name, "Recall@N", path))
+            path = folder / f"{name}.precision.png"
+            figures.precision_recall_curves({r.protocol.name: _precision(evaluated, r) for r in scored}, path, below)
+            drawn.append(Picture(name, "precision and recall over a distance threshold", path))
         for number, result in enumerate(scored):
             protocol = result.protocol.name
             path = folder / f"{name}.{protocol}.errors.png"
@@ -78,6 +82,13 @@ def draw(
             figures.attention_overlay(model, queries, path, "Channel mean of the patch tokens")
             drawn.append(Picture(name, "attention: what the patch tokens of some queries weigh", path))
     return drawn
+
+
+def _precision(evaluated: EvaluationSet, result: Result) -> tuple[np.ndarray, np.ndarray, str]:
+    """Precision, recall and a note for `precision_recall_curves`; thresholds are L2."""
+    squared, right, positives = first_answers(result.predictions, result.distances, evaluated.positives)
+    precision, recall, threshold = precision_recall(np.sqrt(np.maximum(squared, 0)), right, positives)
+    return precision, recall, summary(precision, recall, threshold)
 
 
 def _answers(
