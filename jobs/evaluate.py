@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Literal
 
 from jobs.cli import parse, run_job
+from jobs.there import need_model, need_sets
 from pipeline.common.errors import UsageError
 from pipeline.common.files import check_writable
 from pipeline.config import EvaluationConfig, to_dict
@@ -63,8 +64,9 @@ def main() -> None:
         raise UsageError("--dimensions goes with --from_store; with a checkpoint give --pca")
     if not job.checkpoint:
         raise UsageError("--checkpoint is missing: a run folder such as outputs/cricavpr, or a model file")
-    if not Path(job.checkpoint).exists():  # before seconds of imports
-        raise UsageError(f"{job.checkpoint}: no model there, there is no such file or folder")
+    need_model(job.checkpoint)
+    if len(config.sets) == 1:  # of several, those that are not there are left out
+        need_sets(config)
     from pipeline.training.launch import launched
 
     with launched(job.timeout) as accelerator:

@@ -59,15 +59,17 @@ def main() -> None:
         return
     if not job.table:
         raise UsageError("--table is missing, for example --table ablation_crica")
-    from pipeline.paper import study, table_report
     from pipeline.paper.rows import table
+
+    wanted_table = table(job.table)
+    from pipeline.paper import study, table_report
     from pipeline.paper.runner import Runner
 
     base = RunConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(RunConfig)})
     wanted = dataclasses.replace(job.evaluate, sets=job.sets, root=job.root)
     runner = Runner(Path(job.output), job.launch)
     shards = {"pitts30k_shards": job.pitts30k_shards}
-    filled = study.build(job.table, table(job.table), base, wanted, job.seeds, runner, shards, job.resnet_weights)
+    filled = study.build(job.table, wanted_table, base, wanted, job.seeds, runner, shards, job.resnet_weights)
     if job.dry_run:
         print(table_report.costs(filled, job.images_per_second))
         return

@@ -20,9 +20,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from jobs.cli import parse, run_job
+from jobs.there import need_sets
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import check_writable
 from pipeline.config import EvaluationConfig, ModelConfig
+from pipeline.model.weights.where import check_weights
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,22 @@ def main() -> None:
         return
     if not job.checkpoint:
         raise UsageError("--checkpoint is missing: a run folder such as outputs/cricavpr, or a model file")
+    for source in (job.checkpoint, *job.baseline):
+        check_weights(source)
+    if job.kind == "attention":
+        if not job.photos:
+            raise UsageError("--photos is missing: photos, or a folder of them")
+        for photo in job.photos:
+            if not Path(photo).exists():
+                raise UsageError(f"{photo}: no such photo or folder")
+    if job.kind == "tsne" and not job.places_from:
+        raise UsageError("--places_from is missing: a folder in GSV-Cities' layout, or one with a folder a place")
+    if job.kind == "tsne" and not Path(job.places_from).is_dir():
+        raise UsageError(f"--places_from {job.places_from}: there is no such folder")
+    if job.kind == "qualitative":
+        if not job.baseline or len(job.sets) != 1:
+            raise UsageError("--kind qualitative wants --baseline (one model or more) and one set in --sets")
+        need_sets(job)
     check_writable(Path(job.to).parent, "--to")
     import torch
 
@@ -116,8 +134,6 @@ def places(job: FiguresJob, model: Any, device: Any) -> None:
     from pipeline.paper.paper_figures import place_maps
     from pipeline.paper.place_features import choose_places, stages
 
-    if not job.places_from:
-        raise UsageError("--places_from is missing: a folder in GSV-Cities' layout, or one with a folder a place")
     chosen = choose_places(Path(job.places_from), job.places, job.images, job.seed)
     baselines = [(_short(name), _model(name, model, device)) for name in job.baseline]
     config = _config(job)
@@ -135,8 +151,6 @@ def qualitative(job: FiguresJob, model: Any, device: Any) -> None:
     from pipeline.evaluation.sets.load import load_set
     from pipeline.paper.paper_figures import retrieval_comparison
 
-    if not job.baseline or len(job.sets) != 1:
-        raise UsageError("--kind qualitative wants --baseline (one model or more) and one set in --sets")
     config = _config(job)
     evaluated = load_set(job.sets[0], config)
     results = [("ours", evaluate(model, [evaluated], config, device)[0])]
@@ -167,8 +181,6 @@ def _model(source: str, like: Any | None, device: Any) -> Any:
 
 
 def _photos(given: tuple[str, ...], each: int = 6) -> list[Path]:
-    if not given:
-        raise UsageError("--photos is missing: photos, or a folder of them")
     found: list[Path] = []
     for name in map(Path, given):
         if name.is_dir():

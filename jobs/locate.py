@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from jobs.cli import parse, run_job
-from pipeline.common.errors import UsageError
+from jobs.there import need_model
+from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import check_writable
 
 if TYPE_CHECKING:
@@ -109,6 +110,12 @@ def main() -> None:
             raise UsageError(f"--{name} is {getattr(job, name)}; it must be above 0")
     if job.apart_frames is not None and job.apart_frames < 0:
         raise UsageError(f"--apart_frames is {job.apart_frames}; it must be at least 0")
+    need_model(job.checkpoint)
+    for path in (*job.photos, *job.build):
+        if not Path(path).exists() and not set(path) & set("*?["):
+            raise UsageError(f"{path}: no such photo or folder")
+    if not job.build and not Path(job.index).is_dir():
+        raise DataError(f"{job.index}: no finished index there; make one with --build PHOTOS")
     run(job)
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from jobs.cli import parse, run_job
+from jobs.there import need_model, need_shards
 from pipeline.common.errors import UsageError
 from pipeline.config import DataConfig
 
@@ -51,6 +52,8 @@ def main() -> None:
     if job.round < 0:
         raise UsageError(f"--round is {job.round}; rounds are counted from 0")
     data = DataConfig(shards=job.shards, workers=job.workers, cache=job.cache)
+    need_model(job.checkpoint)
+    need_shards(job.shards)
     from pipeline.training.launch import launched
 
     with launched(job.timeout) as accelerator:

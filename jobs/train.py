@@ -1,9 +1,9 @@
 """Train one run, or continue it: accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.train --config FILE
 
 Also runs without the launcher, in one process: `python -m jobs.train --config FILE --data.places_per_batch 16`.
-The same command continues a run that was killed. `--dry_run` prints the plan and exits. Exit codes: 0 done, 2 usage
-or configuration, 3 data, 4 diverged, 75 preempted and saved, 130 interrupted. `accelerate launch` turns every code
-but 0 into 1; `<run>/status.json` has the true one.
+The same command continues a run that was killed. `--dry_run` prints the plan and exits; `--fast_dev_run` tries
+everything in two small steps. Exit codes: 0 done, 2 usage or configuration, 3 data, 4 diverged, 75 preempted and saved,
+130 interrupted. `accelerate launch` turns every code but 0 into 1; `<run>/status.json` has the true one.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import sys
 from dataclasses import dataclass
 
 from jobs.cli import parse, run_job
+from jobs.there import need_sets, need_shards, need_weights
 from pipeline.config import RunConfig, changed
 
 
@@ -22,12 +23,18 @@ class TrainJob(RunConfig):
 
     dry_run: bool = False
     """Print the plan (batches, steps, parameters, memory, disk) and exit."""
+    fast_dev_run: bool = False
+    """Try the run: two small steps, a small validation, and all files, in `<output>/<name>-fast-dev-run`."""
 
 
 def main() -> None:
     """Parses, trains, says how it ended."""
     job = parse(TrainJob, __doc__ or "")
     config = RunConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(RunConfig)})
+    need_shards(config.data.shards)
+    need_sets(config.validate)
+    if not job.dry_run:  # which needs no weights
+        need_weights(config.model)
     from pipeline.training.launch import launched
 
     with launched(config.train.timeout) as accelerator:
@@ -35,26 +42,24 @@ def main() -> None:
         if first:
             told = [f"  {name}: {value}" for name, value in changed(config, RunConfig()).items()]
             print("\n".join(["settings that differ from the defaults:", *told]), flush=True)
-            if config.model.trainable != "full" and config.model.backbone.weights is None:
-                print(
-                    "warning: model.backbone.weights is not set, so the part of the backbone that model.trainable "
-                    f"'{config.model.trainable}' leaves frozen is random numbers; give it released weights",
-                    file=sys.stderr,
-                )
         if job.dry_run:
             from pipeline.training.dry_run import preview, show
+            from pipeline.training.initialise import random_and_frozen
 
+            if first and (remark := random_and_frozen(config.model)):
+                print(f"warning: {remark}", file=sys.stderr)
             rows = preview(config)  # on all ranks: the model's forward pass has collectives
             if first:
                 print(show(rows))
             return
         from pipeline.training.trainer import train
+        from pipeline.training.trial import STEPS, try_out
 
-        outcome = train(config, accelerator)
+        outcome = try_out(config, accelerator) if job.fast_dev_run else train(config, accelerator)
         if first:
-            from pipeline.training.run_log import draw
+            from pipeline.training.run_log import FEWEST, draw
 
-            picture = draw(outcome.run)
+            picture = draw(outcome.run, STEPS if job.fast_dev_run else FEWEST)
             print(f"{outcome.run}: {outcome}", flush=True)
             print(f"see {outcome.run / 'train.log'}" + (f" and {picture}" if picture else ""), flush=True)
 

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Literal
 from jobs.cli import parse, run_job
 from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig
+from pipeline.model.weights.where import check_weights
 
 if TYPE_CHECKING:
     from pipeline.model.vpr import PlaceModel
@@ -34,7 +35,8 @@ class WeightsJob:
 
     source: str = ""
     """A run or checkpoint folder, a file of ours, a released CricaVPR or DINOv2 .pth, a release of another method
-    (CosPlace, EigenPlaces, MixVPR, SALAD, BoQ, NetVLAD, SFRS, GCL), a transformers folder or hub name."""
+    (CosPlace, EigenPlaces, MixVPR, SALAD, BoQ, NetVLAD, SFRS, GCL), a transformers folder, or hub:OWNER/NAME
+    (asked of the model hub, if it is not on this machine already)."""
     to: str = ""
     """The file to write: .safetensors, .pth or .onnx; none: only say what the source is."""
     kind: Literal[
@@ -64,6 +66,7 @@ def main() -> None:
         raise UsageError(f"--to {job.to}: the ending decides what is written; give one of {', '.join(ENDINGS)}")
     if target is not None and target.exists() and target.resolve() == Path(job.source).expanduser().resolve():
         raise UsageError(f"--to {job.to} is the source itself; give another file")
+    check_weights(job.source)
     from pipeline.model.weights import convert
 
     found = convert.kind_of(job.source)

@@ -36,7 +36,8 @@ class BackboneConfig(Settings):
     name: BackboneName = setting("dinov2_vitb14", changes="numbers")
     """DINOv2 (paper: ViT-B/14 without registers), with registers, DINOv3, a residual network, VGG-16, or custom."""
     weights: str | None = setting(None, changes="numbers", resume="free")
-    """Released weights: a .pth, a safetensors file, a transformers folder or hub name; none: random weights."""
+    """Released weights: a .pth, a safetensors file, a transformers folder, or hub:OWNER/NAME; none: random
+    weights."""
     dim: int = setting(768, changes="numbers", at_least=1, at_most=8192)
     """custom: channels D of a token."""
     depth: int = setting(12, changes="numbers", at_least=1, at_most=100)

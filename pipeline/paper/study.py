@@ -18,6 +18,7 @@ from pipeline.config import EvaluationConfig, RunConfig
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.evaluation.sets.load import load_set
 from pipeline.evaluation.sets.registry import published_name
+from pipeline.model.weights.where import HUB
 from pipeline.paper.plan import Cell, Training, distinct, evaluation, own_settings, training
 from pipeline.paper.recorded import recorded, recorded_speed
 from pipeline.paper.rows import Row, Table
@@ -171,7 +172,7 @@ def _sets(study: Study, evaluate: EvaluationConfig) -> None:
 
 def _weights(study: Study, base: RunConfig) -> None:
     weights = base.model.backbone.weights
-    if weights and "/" in weights and not Path(weights).exists() and Path(weights).suffix:
+    if weights and not weights.startswith(HUB) and not Path(weights).expanduser().exists():
         study.missing.append(f"{weights}: the backbone's weights are not there")
 
 

@@ -12,7 +12,7 @@ import sys
 import torch
 from torch import Tensor
 
-from pipeline.config import RunConfig
+from pipeline.config import ModelConfig, RunConfig
 from pipeline.data.images import normalise
 from pipeline.data.places import build_loader
 from pipeline.distributed import broadcast_tensors, on_rank_0
@@ -65,3 +65,14 @@ def sample_features(model: PlaceModel, index: ShardIndex, config: RunConfig, dev
             break
     model.train()
     return torch.cat(found)[: wanted.samples]
+
+
+def random_and_frozen(model: ModelConfig) -> str:
+    """What is odd about a backbone of random numbers that training leaves frozen, and what to do; "" where none is."""
+    if model.trainable == "full" or model.backbone.weights is not None:
+        return ""
+    return (
+        f"model.backbone.weights is not set, and model.trainable '{model.trainable}' leaves (a part of) the backbone "
+        "frozen, as random numbers; give the file of released weights (docs/weights.md), or train it whole with "
+        "--model.trainable full"
+    )

@@ -44,13 +44,13 @@ def read(run: Path) -> dict[str, list[tuple[int, float]]]:
     return found
 
 
-def draw(run: Path) -> Path | None:
-    """Loss and validation R@1 and R@5 over the steps as `<run>/curves.png`; None where there is too little to see, or
-    matplotlib is not installed."""
+def draw(run: Path, fewest: int = FEWEST) -> Path | None:
+    """Loss and validation R@1 and R@5 over the steps as `<run>/curves.png`; None where there are fewer than `fewest`
+    records, or matplotlib is not installed."""
     metrics = read(run)
     loss = metrics.get("train/loss", [])
     recalls = {name: points for name, points in metrics.items() if re.search(r"recall_at_[15]$", name)}
-    if len(loss) < FEWEST:
+    if len(loss) < fewest:
         return None
     try:
         from matplotlib.figure import Figure

@@ -45,7 +45,7 @@ from pipeline.training.checkpoint import RunState
 from pipeline.training.compiled import compile_backbone, uncompiled
 from pipeline.training.engines.base import Engine
 from pipeline.training.engines.build import build_engine, choose
-from pipeline.training.initialise import initialise
+from pipeline.training.initialise import initialise, random_and_frozen
 from pipeline.training.launch import notice_of, stop_at, stop_signals
 from pipeline.training.loss import MultiSimilarityLoss
 from pipeline.training.meter import Meter
@@ -80,14 +80,19 @@ class Outcome:
         return line
 
 
-def train(config: RunConfig, accelerator: Any) -> Outcome:
+def train(config: RunConfig, accelerator: Any, queries: int | None = None) -> Outcome:
     """Trains in the run's folder, which it holds alone and whose `status.json` it keeps. Collective.
+
+    Args:
+        config: the run.
+        accelerator: from `launch.start`.
+        queries: validate on the first so many of each set only (a trial); none: on all.
 
     Raises:
         UsageError: another training works in the folder, or it cannot be written; and as `Trainer`.
     """
     with working_in(Path(config.output) / config.name) as status:
-        outcome = Trainer(config, accelerator).fit()
+        outcome = Trainer(config, accelerator, queries).fit()
         status.message = str(outcome)
         return outcome
 
@@ -98,12 +103,13 @@ class Trainer:
     Args:
         config: the run.
         accelerator: from `launch.start`.
+        queries: as for `train`.
 
     Raises:
         UsageError, DataError: the config does not fit the launch, the shards or the run being resumed.
     """
 
-    def __init__(self, config: RunConfig, accelerator: Any) -> None:
+    def __init__(self, config: RunConfig, accelerator: Any, queries: int | None = None) -> None:
         self.config, self.accelerator = config, accelerator
         self.main = rank() == 0
         self.run = Path(config.output) / config.name
@@ -122,6 +128,8 @@ class Trainer:
         same(self.index.digest, f"the digest of the shards {config.data.shards}")
         self.steps_per_epoch = len(self._plan(0).batches)
         check_batch(config, self.steps_per_epoch)
+        if self.main and (remark := random_and_frozen(config.model)):
+            print(f"warning: {remark}", file=sys.stderr, flush=True)
         self.total_steps = self.steps_per_epoch * config.train.epochs
         if config.train.steps is not None:
             self.total_steps = min(self.total_steps, config.train.steps)
@@ -157,7 +165,9 @@ class Trainer:
             self.mining = agreed(lambda: Mining(config, self.index, self.run, origin))
         self.validation: Validation | None = None
         if config.validate.sets:
-            self.validation = agreed(lambda: Validation(config, accelerator.device), what="reading validate.sets")
+            self.validation = agreed(
+                lambda: Validation(config, accelerator.device, queries), what="reading validate.sets"
+            )
         self._compare_scores()
         self.training_bank = TrainingBank(config, self.index, accelerator.device)
         self.bank: tuple[int, Bank | None] = (-1, None)

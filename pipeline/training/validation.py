@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import sys
 from typing import Any
 
+import numpy as np
 from torch import nn
 
 from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 
 class Validation:
@@ -24,13 +27,14 @@ class Validation:
     Args:
         config: of the run; `config.validate` says sets and protocols.
         device: where descriptors are computed.
+        queries: take so many queries of each set, with a database of as many images; none: all.
 
     Raises:
         DataError: a set is missing or not laid out as documented.
         UsageError: a set cannot be scored.
     """
 
-    def __init__(self, config: RunConfig, device: Any) -> None:
+    def __init__(self, config: RunConfig, device: Any, queries: int | None = None) -> None:
         from pipeline.evaluation.sets.load import load_set
 
         if config.validate.rerank:
@@ -48,6 +52,8 @@ class Validation:
                     f"validate.sets: {name} has no ground truth, so no recall could choose a checkpoint; take another "
                     "set, and let jobs.evaluate export this one's predictions"
                 )
+        if queries is not None:
+            self.sets = [first(evaluated, queries) for evaluated in self.sets]
         self.device = device
 
     def identity(self) -> str:
@@ -79,3 +85,29 @@ class Validation:
                 recalls = "  ".join(f"R@{k} {value:.1f}" for k, value in result.recalls.items())
                 print(f"validation  {result.set_name}  {result.protocol.name}  {recalls}", file=sys.stderr, flush=True)
         return values, results[0].recalls[5]
+
+
+def first(whole: EvaluationSet, queries: int) -> EvaluationSet:
+    """The first queries of a set, and a database of as many images: a positive of each, and others in their order.
+
+    Its name ends in `_first<queries>`, so that its recall is not taken for the set's.
+    """
+    asked = min(queries, len(whole.queries))
+    found = {int(rows[0]) for rows in whole.positives[:asked] if len(rows)}
+    others = (row for row in range(len(whole.database)) if row not in found)
+    rows = np.array(sorted([*found, *itertools.islice(others, asked - len(found))]))
+
+    def part(values: np.ndarray | None, chosen: np.ndarray) -> np.ndarray | None:
+        return None if values is None else values[chosen]
+
+    return dataclasses.replace(
+        whole,
+        name=f"{whole.name}_first{asked}",
+        database=[whole.database[row] for row in rows],
+        queries=whole.queries[:asked],
+        positives=[np.flatnonzero(np.isin(rows, kept)) for kept in whole.positives[:asked]],
+        database_positions=part(whole.database_positions, rows),
+        query_positions=part(whole.query_positions, np.arange(asked)),
+        database_part=part(whole.database_part, rows),
+        query_part=part(whole.query_part, np.arange(asked)),
+    )

@@ -42,7 +42,7 @@ def load_set(name_or_path: str, config: EvaluationConfig) -> EvaluationSet:
     if name is not None:
         folder = _find(config.root, name, config.split)
         if folder is None:
-            raise DataError(_missing(name, config.root))
+            raise DataError(_missing(name, config.root, config.split))
         return _load_published(name, folder, config, route)
     path = Path(text).expanduser()
     if not path.exists():
@@ -68,7 +68,8 @@ def load_sets(names: Sequence[str], config: EvaluationConfig) -> tuple[list[Eval
         try:
             sets.append(load_set(name, config))
         except (DataError, UsageError) as error:
-            left_out.append(f"{name}: {error}")
+            told = str(error)  # most name the set already
+            left_out.append(told if told.startswith(name) else f"{name}: {told}")
     if not sets:
         raise DataError("; ".join(left_out) or f"no evaluation set under {config.root}/: give --sets or --root")
     return sets, left_out
@@ -83,7 +84,7 @@ def _load_published(name: str, folder: Path, config: EvaluationConfig, route: st
     elif entry.layout in ("utm", "svox"):
         base = layouts.split_folder(folder, config.split, entry.queries)
         if base is None:
-            raise DataError(_missing(name, config.root, folder))
+            raise DataError(_missing(name, config.root, config.split, folder))
         loaded = _unread(layouts.from_folders(name, base, config, entry.queries), folder, base)
     elif entry.layout == "pairs":
         loaded = _unread(layouts.pairs(name, folder, config), folder)
@@ -232,11 +233,10 @@ def _is_there(name: str, folder: Path, split: str) -> bool:
     return looks[entry.layout]() is not None or _published_lists(name, folder, split) is not None
 
 
-def _missing(name: str, root: str, folder: Path | None = None) -> str:
+def _missing(name: str, root: str, split: str, folder: Path | None = None) -> str:
     expected = folder or Path(root) / SETS[name].folders[0]
-    return f"{name} is not there: expected {expected}/ with {SETS[name].looks}" + (
-        f"; {_contents(folder)}" if folder else ""
-    )
+    looks = SETS[name].looks.replace("{split}", split)
+    return f"{name} is not there: expected {expected}/ with {looks}" + (f"; {_contents(folder)}" if folder else "")
 
 
 @dataclass(frozen=True)
@@ -261,7 +261,7 @@ def available(root: str, split: str = "test") -> list[Availability]:
         if folder is not None and not _is_there(name, folder, split):
             folder = None
         known |= {folder, _find(root, name, split)}
-        found.append(Availability(name, folder, _missing(name, root).partition("expected ")[2]))
+        found.append(Availability(name, folder, _missing(name, root, split).partition("expected ")[2]))
     for folder in sorted(below.iterdir()) if below.is_dir() else []:
         if folder.is_dir() and folder not in known and layouts.split_folder(folder, split) is not None:
             found.append(Availability(folder.name, folder, str(folder)))

@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
-UTM_LAYOUT = "images/{split}/{database,queries}/**/@UTM_east@UTM_north@...@.jpg"
+UTM_LAYOUT = "images/{split}/{database,queries}/.../@UTM_east@UTM_north@...@.jpg"
 
 
 @dataclass(frozen=True)

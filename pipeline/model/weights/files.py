@@ -25,8 +25,9 @@ from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.foreign import check_file, message
 from pipeline.model.weights.names import fit, layout, to_published
 from pipeline.model.weights.pretrained import read_tensors, unwrap
+from pipeline.model.weights.where import FILE as FILE
+from pipeline.model.weights.where import checkpoint_file as checkpoint_file
 
-FILE = "model.safetensors"
 FORMAT = "place-model 1"
 PUBLISHED_SIZE = 224
 
@@ -169,24 +170,6 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
         }
     except (KeyError, ValueError, TypeError, AttributeError) as error:
         raise DataError(f"{file}: its metadata is damaged ({message(error)})") from error
-
-
-def checkpoint_file(path: str | Path) -> Path:
-    """The model file behind a path: itself, a checkpoint folder's, or a run folder's best, else last checkpoint's.
-
-    Raises:
-        UsageError: there is none.
-    """
-    given = Path(path)
-    if given.is_file():
-        return given
-    places = [given / "checkpoints" / "best", given / "best", given / "checkpoints" / "last", given / "last"]
-    for folder in (given, *places):
-        if folder.is_file():  # a pointer in a text file instead of a link
-            folder = folder.parent / folder.read_text().strip()
-        if (folder / FILE).is_file():
-            return folder / FILE
-    raise UsageError(f"{given}: no model there (a .safetensors file, a checkpoint folder, or a run folder is needed)")
 
 
 def check_digest(file: Path) -> None:

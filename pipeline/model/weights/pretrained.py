@@ -1,7 +1,8 @@
-"""Released weights from wherever they lie: .pth, safetensors, a transformers folder, or a hub name.
+"""Released weights from wherever they lie: a .pth, safetensors, a transformers folder, the hub (`hub:OWNER/NAME`).
 
 Invariant: nothing foreign is ever executed: pickles are read with `weights_only=True`, everything else is
-safetensors; every failure is one line that names the source.
+safetensors; every failure is one line that names the source. Nothing is asked of the network but what begins with
+`hub:`, so a mistyped path stays here.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from pipeline.common.errors import DataError, UsageError
 from pipeline.common.text import shown
 from pipeline.model.weights.foreign import check_file, check_tensors, is_safetensors, message
 from pipeline.model.weights.names import fit, published_name, to_published
+from pipeline.model.weights.where import FILE, HUB, HUB_NAME, no_such_weights
 
-FILE = "model.safetensors"
 # wrappers that training codes put around a state dict
 WRAPPERS = ("model_state_dict", "state_dict", "model", "teacher")
 # what torch.compile, sharding and checkpointing add to the names of the modules they wrap, at any depth
@@ -31,12 +32,15 @@ INSIDE = re.compile("|".join(rf"(?:(?<=\.)|^){re.escape(word)}" for word in ADDE
 
 
 def read_tensors(source: str) -> dict[str, Tensor]:
-    """The state dict of a file (.pth .pt .bin .safetensors), a transformers folder or a hub name, on the CPU.
+    """The state dict of a file (.pth .pt .bin .safetensors), a transformers folder or `hub:OWNER/NAME`, on the
+    CPU.
 
     Raises:
         UsageError: nothing there under that path or name.
         DataError: a file that is broken, or that holds more than tensors.
     """
+    if source.startswith(HUB):
+        return _read_safetensors(_from_hub(source.removeprefix(HUB)))
     path = Path(source).expanduser()
     if path.is_dir():
         index = path / "model.safetensors.index.json"
@@ -47,9 +51,7 @@ def read_tensors(source: str) -> dict[str, Tensor]:
         return _read_safetensors(path / FILE)
     if path.is_file():
         return _read_file(path)
-    if path.suffix or source.count("/") != 1:
-        raise UsageError(f"{shown(source)}: there is no such weights file or folder")
-    return _read_safetensors(_from_hub(source))
+    raise UsageError(no_such_weights(source))
 
 
 def _read_file(path: Path) -> dict[str, Tensor]:
@@ -130,6 +132,8 @@ def unwrap(state: Mapping[str, Any], source: str) -> dict[str, Tensor]:
 
 
 def _from_hub(name: str) -> Path:
+    if HUB_NAME.fullmatch(name) is None:
+        raise UsageError(f"{shown(HUB + name)}: a name on the model hub is OWNER/NAME, as in hub:facebook/dinov2-base")
     from huggingface_hub import HfApi, hf_hub_download
 
     try:
@@ -140,7 +144,7 @@ def _from_hub(name: str) -> Path:
             return Path(hf_hub_download(name, FILE))
         except Exception as error:  # the client's own errors and those of every network library under it
             raise UsageError(
-                f"{name}: no such file or folder here, and the model hub did not give it ({message(error)}); "
+                f"{HUB}{name}: the model hub did not give it ({message(error)}); "
                 "download the weights and give their path"
             ) from missing
 

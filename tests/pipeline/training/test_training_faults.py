@@ -288,6 +288,24 @@ def test_dry_run_on_two_processes(root: Path) -> None:
     assert not (root / "outputs/dry").exists()
 
 
+def test_a_trial_on_two_processes_writes_everything_and_touches_no_run(root: Path) -> None:
+    """It replaces what a former trial left."""
+    trial = root / "outputs" / "tried-fast-dev-run"
+    (trial / "checkpoints" / "step-00000007").mkdir(parents=True)
+    words = ["--config", str(written(root, "tried", epochs=50, schedule="cosine")), "--fast_dev_run"]
+    words += ["--tracking.enabled", "true", "--validate.sets", str(root / "evaluation"), "--validate.groups", "bank"]
+    job = Launched("ddp", 2, "jobs.train", words, root / "tried.log")
+    assert "steps: step 2" in job.done()
+    files = {str(file.relative_to(trial)) for file in trial.rglob("*")}
+    last = "checkpoints/step-00000002"
+    assert {f"{last}/model.safetensors", f"{last}/bank.safetensors", "curves.png", "mlflow_run_id"} <= files
+    assert "checkpoints/step-00000007" not in files
+    steps = [json.loads(line) for line in (trial / "samples.rank1.jsonl").read_text().splitlines()]
+    assert [len(step["samples"]) for step in steps] == [2, 2], "places of this rank"
+    assert "validation/evaluation_first8.bank8_28px.recall_at_5 " in (trial / "train.log").read_text()
+    assert not (root / "outputs" / "tried").exists()
+
+
 def test_a_second_training_in_a_folder_is_refused(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And what its status says while it runs, after a SIGKILL, and after Ctrl-C."""
     monkeypatch.setattr(run_folder, "ENDING", 0.3)  # inherited by the forked jobs

@@ -6,11 +6,13 @@ import csv
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipeline.common.errors import UsageError
 from pipeline.config import EvaluationConfig, RunConfig
-from pipeline.training.validation import Validation
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
+from pipeline.training.validation import Validation, first
 
 
 def test_a_set_that_cannot_be_scored_is_refused_at_the_start(tmp_path: Path) -> None:
@@ -24,3 +26,23 @@ def test_a_set_that_cannot_be_scored_is_refused_at_the_start(tmp_path: Path) -> 
     validate = EvaluationConfig(sets=("msls_challenge",), root=str(tmp_path))
     with pytest.raises(UsageError, match=r"validate\.sets: msls_challenge has no ground truth"):
         Validation(dataclasses.replace(RunConfig(), validate=validate), "cpu")
+
+
+def test_the_first_queries_keep_their_positives() -> None:
+    """Query q has the positives q + 10 and q + 11 of 24 database images, and the last of the first four has none."""
+    whole = EvaluationSet(
+        "town",
+        [Path(f"d{row}.jpg") for row in range(24)],
+        [Path(f"q{row}.jpg") for row in range(8)],
+        [np.array([row + 10, row + 11]) if row != 3 else np.zeros(0, np.int64) for row in range(8)],
+        "25 m",
+        database_positions=np.arange(48.0).reshape(24, 2),
+    )
+    part = first(whole, 4)
+    assert part.name == "town_first4" and part.queries == whole.queries[:4]
+    assert part.database == [Path(f"d{row}.jpg") for row in (0, 10, 11, 12)]
+    assert [[part.database[row].stem for row in rows] for rows in part.positives] == [
+        ["d10", "d11"], ["d11", "d12"], ["d12"], [],
+    ]  # fmt: skip
+    assert part.database_positions is not None and part.database_positions[1].tolist() == [20.0, 21.0]
+    assert first(whole, 99).queries == whole.queries

@@ -11,7 +11,7 @@ import pytest
 from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet, list_images
-from pipeline.evaluation.sets.load import available, load_set
+from pipeline.evaluation.sets.load import available, load_set, load_sets
 from pipeline.evaluation.sets.registry import SETS, published_name
 
 
@@ -259,3 +259,14 @@ def test_a_set_is_consistent_or_not_built(tmp_path: Path) -> None:
         EvaluationSet("s", [], photo, [np.array([], np.int64)], "pairs")
     with pytest.raises(DataError, match="no jpg, jpeg or png"):
         list_images(tmp_path)
+
+
+def test_a_missing_set_is_named_once_and_without_placeholders(tmp_path: Path) -> None:
+    config = EvaluationConfig(root=str(tmp_path), split="val")
+    for name in ("gardens_point", "pitts30k", "atlantis", "tokyo247"):
+        with pytest.raises(DataError) as told:
+            load_sets([name], config)
+        assert str(told.value).startswith(name) and f"{name}: {name}" not in str(told.value)
+        assert "{split}" not in str(told.value)
+    with pytest.raises(DataError, match="images/val/"):
+        load_sets(["pitts30k"], config)

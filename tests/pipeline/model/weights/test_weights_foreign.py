@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from pipeline.common.errors import DataError, UsageError
+from pipeline.model.weights import pretrained
 from pipeline.model.weights.files import read_metadata
 from pipeline.model.weights.pretrained import read_tensors
 
@@ -161,3 +162,26 @@ def test_an_index_names_files_beside_it_alone(tmp_path: Path, file: str | None) 
         read_tensors(str(folder))
     with pytest.raises(UsageError, match="no such weights file"):
         read_tensors(str(tmp_path / "nothing.pth"))
+
+
+def test_only_what_begins_with_hub_is_asked_of_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def hub(name: str) -> Path:
+        asked.append(name)
+        raise UsageError("the hub was asked")
+
+    monkeypatch.setattr(pretrained, "_from_hub", hub)
+    monkeypatch.chdir(tmp_path)
+    for mistyped in ("weigths/dinov2", "facebook/dinov2-base", "a/b/c", "dinov2", "~/dinov2"):
+        with pytest.raises(UsageError, match="there is no such weights file or folder"):
+            read_tensors(mistyped)
+    with pytest.raises(UsageError, match="if a model of the model hub is meant, write hub:facebook/dinov2-base"):
+        read_tensors("facebook/dinov2-base")
+    assert asked == []
+    with pytest.raises(UsageError, match="the hub was asked"):
+        read_tensors("hub:facebook/dinov2-base")
+    assert asked == ["facebook/dinov2-base"]
+    monkeypatch.undo()
+    with pytest.raises(UsageError, match=r"hub:\.\./x: a name on the model hub is OWNER/NAME"):
+        read_tensors("hub:../x")
