@@ -156,7 +156,7 @@ def test_figures_complain_in_one_line(folder: Path, monkeypatch: pytest.MonkeyPa
     run = ["--checkpoint", str(folder / "outputs/run"), "--to", "x.png"]
     cases = [
         (["--kind", "tsne", *run, "--places-from", str(folder / "gsv"), "--images", "13"], "--images 12 would do"),
-        (["--kind", "tsne", *run], "--places-from is missing"),
+        (["--kind", "tsne", *run], "--places_from is missing"),
         (["--kind", "attention", *run], "--photos is missing"),
         (["--kind", "qualitative", *run, "--sets", "x"], "wants --baseline"),
         (["--kind", "attention", "--to", "x.txt"], "a file ending in .png or .jpg"),

@@ -283,4 +283,4 @@ def test_colleagues_can_read_a_checkpoint(root: Path, whole: str) -> None:
     mask = os.umask(0o022)
     os.umask(mask)
     files = list((root / "outputs" / whole / "checkpoints/last").iterdir())
-    assert len(files) == 3 and {file.stat().st_mode & 0o777 for file in files} == {0o666 & ~mask}
+    assert len(files) == 4 and {file.stat().st_mode & 0o777 for file in files} == {0o666 & ~mask}
