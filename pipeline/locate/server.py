@@ -49,7 +49,7 @@ HEADERS = {
 def make_app(locator: Locator, count: int) -> Flask:
     """The pages: `/` (form and, after a post, answers), `/photo/ROW` (a photo of the index, small), `/page.js`."""
     from flask import Flask, Response, abort, render_template, request
-    from werkzeug.exceptions import HTTPException
+    from werkzeug.exceptions import HTTPException, SecurityError
 
     app = Flask(__name__, template_folder=".", static_folder=None)
     app.config.update(MAX_CONTENT_LENGTH=UPLOAD_BYTES, MAX_FORM_PARTS=4, MAX_FORM_MEMORY_SIZE=4096, TRUSTED_HOSTS=HOSTS)
@@ -78,6 +78,8 @@ def make_app(locator: Locator, count: int) -> Flask:
 
     @app.errorhandler(HTTPException)
     def told(error: HTTPException) -> tuple[str, int]:
+        if isinstance(error, SecurityError):  # the page under that name could read this answer: it tells nothing
+            return "this name is not answered; open http://127.0.0.1", 400
         reason = error.description or error.name
         if error.code == 413:
             reason = f"the photo is larger than {UPLOAD_BYTES // 2**20} MB; send a smaller one"
