@@ -90,7 +90,7 @@ def test_headings_and_cells_can_be_set(tmp_path: Path) -> None:
     put(tmp_path, utm(500001, 6900001, "10"), utm(500019, 6900001, "200"))
     assert read_source(tmp_path).listed.num_rows == 2
     assert read_source(tmp_path, SourceRule(cell_m=20, heading_deg=0)).listed.num_rows == 1
-    with pytest.raises(UsageError, match="cell-m"):
+    with pytest.raises(UsageError, match="cell_m"):
         read_source(tmp_path, SourceRule(cell_m=0))
 
 
