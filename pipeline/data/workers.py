@@ -143,7 +143,7 @@ def batches(loader: DataLoader[Any], stop: Callable[[], bool] = lambda: False) -
         except StopIteration:
             return
         except UserError as error:  # raised in a worker: torch put its traceback into the text
-            text = str(error).strip().splitlines()
+            text = str(error.args[0]).strip().splitlines()
             raise (type(error)(text[-1].partition(": ")[2]) if text[0].startswith("Caught ") else error) from None
         except RuntimeError as error:
             if "timed out" in str(error) and loader.timeout:

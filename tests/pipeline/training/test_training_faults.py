@@ -136,7 +136,7 @@ def test_faults_on_one_rank_end_both_alike(root: Path, monkeypatch: pytest.Monke
         found["member does not decode"] = ended(run_config(plain("member"), data_shards=str(shards)))
         full = small_files(300) if one else _nothing()
         found["sample log on a full disk"] = ended(run_config(plain("log")), lambda: full)
-        full = small_files(8_000) if not one else _nothing()
+        full = small_files(20_000) if not one else _nothing()
         ended(run_config(plain("save", steps=2)))  # a whole checkpoint first
         found["checkpoint on a full disk"] = ended(run_config(plain("save", steps=6)), lambda: full)
         own = str(root / "a-file" / "x") if one else str(root / "outputs")
@@ -434,7 +434,7 @@ def test_too_little_shared_memory_is_one_line(root: Path) -> None:
     )  # fmt: skip
     print(f"small /dev/shm, twice: {time.monotonic() - start:.1f} s")
     lines = done.stdout.splitlines()
-    assert len(lines) == 2 and all(line.startswith("/dev/shm, through which") for line in lines), done
+    assert len(lines) == 2 and all(line.startswith("/dev/shm, through which") for line in lines), (lines, done.stderr)
 
 
 def test_without_symbolic_links_last_and_best_are_text(

@@ -159,7 +159,7 @@ def test_changed_settings_are_refused_by_name(root: Path, whole: str) -> None:
 
 
 def test_divergence_ends_with_4_and_keeps_the_last_good_checkpoint(root: Path) -> None:
-    path = config(root, "diverged", train__lr=1e30, train__optimizer="sgd", validate__sets=[], train__save_every=1)
+    path = config(root, "diverged", train__lr=1e9, train__optimizer="sgd", validate__sets=[], train__save_every=1)
     out = train(path, code=4)
     assert re.search(r"jobs.train: .*not finite|jobs.train: the loss is nan", out)
     assert "Traceback" not in out
