@@ -42,11 +42,12 @@ def test_jobs_say_so_before_the_work(tmp_path: Path, job: str, monkeypatch: pyte
         "evaluate": ("jobs.evaluate", ["--checkpoint", model, "--output", bad]),
         "evaluate-store": ("jobs.evaluate", ["--from_store", str(tmp_path), "--output", bad]),
         "locate-build": ("jobs.locate", ["--checkpoint", model, "--build", str(tmp_path), "--index", bad]),
-        "locate": ("jobs.locate", ["--checkpoint", model, "--index", str(tmp_path / "index"), "--photos",
+        "locate": ("jobs.locate", ["--checkpoint", model, "--index", str(tmp_path), "--photos",
                                    str(tmp_path / "a.jpg"), "--output", bad]),
-        "figures": ("jobs.figures", ["--kind", "attention", "--checkpoint", model, "--to", bad + "/x.png"]),
+        "figures": ("jobs.figures", ["--kind", "attention", "--checkpoint", model, "--photos",
+                                     str(tmp_path / "a.jpg"), "--to", bad + "/x.png"]),
     }[job]  # fmt: skip
     monkeypatch.setattr(sys, "argv", [name, *options])
     with pytest.raises(UsageError, match=r"out: cannot be written \(Not a directory\); give another folder"):
         importlib.import_module(name).main()
-    assert not (tmp_path / "index").exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.jpg", "file", "model.safetensors"]

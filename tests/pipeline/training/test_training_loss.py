@@ -95,9 +95,9 @@ def test_a_person_sees_the_mined_anchors_of_both_kinds_of_description(monkeypatc
     shown: list[str] = []
     monkeypatch.setattr("pipeline.common.progress.Progress.advance", lambda self, n, text: shown.append(text))
     meter = Meter(16, 2, RunState(index=""), enabled=False)
-    meter.record(0.5, (1.0, 0.5))
-    meter.record(0.5, (0.5, 0.5))
-    assert "mined 100% and alone 50%" in shown[0] and "mined 75% and alone 50%" in shown[1]
+    meter.record(0.5, (1.0, 0.5), 12.0)
+    meter.record(0.5, (0.5, 0.5), 12.0)
+    assert "mined 100% and alone 50%, 12.0 negatives each" in shown[0] and "mined 75% and alone 50%" in shown[1]
     assert mined_metrics(meter.report().mined) == {
         "train/mined_anchors": 62.5, "train/mined_anchors_group": 75.0, "train/mined_anchors_alone": 50.0
     }  # fmt: skip
