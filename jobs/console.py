@@ -13,7 +13,7 @@ from typing import NoReturn
 
 from jobs.cli import run_job
 
-JOBS = sorted({path.stem for path in Path(__file__).parent.glob("*.py")} - {"__init__", "cli", "console"})
+JOBS = sorted({path.stem for path in Path(__file__).parent.glob("*.py")} - {"__init__", "cli", "console", "there"})
 
 
 def __getattr__(name: str) -> Callable[[], NoReturn]:
