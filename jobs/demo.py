@@ -188,7 +188,8 @@ def pictures(out: Path, test_set: str) -> None:
     evaluated, folder = load_set(test_set, EvaluationConfig()), out / "images"
     curves = {}
     for row in ROWS:
-        kept = load_predictions(out / row.run / "evaluation" / "predictions" / f"{SET}.single.parquet")
+        (file,) = (out / row.run / "evaluation" / "predictions").glob(f"{SET}.single*.parquet")
+        kept = load_predictions(file)
         recalls = {1: 100.0 * float(np.mean(kept.ranks == 0))}
         answers = (len(evaluated.queries), len(evaluated.database), 0, kept.rows, kept.distances)
         result = Result(SET, kept.protocol, recalls, *answers)
@@ -200,7 +201,7 @@ def pictures(out: Path, test_set: str) -> None:
     figures.retrieval_grid(evaluated, result, chosen, grid, "Where was this photo taken?", answers=4)
     with Image.open(grid) as image:
         image.thumbnail((960, 960))
-        image.save(grid, quality=80)
+        image.save(grid, quality=72)
 
 
 def ending(out: Path, seconds: float) -> None:
@@ -210,6 +211,7 @@ def ending(out: Path, seconds: float) -> None:
         results = json.loads((out / row.run / "evaluation" / "results.json").read_text())["results"]
         found[row.run] = {result["protocol_name"]: result["recalls"] for result in results}
     protocols = list(dict.fromkeys(name for recalls in found.values() for name in recalls))
+    alone = next(name for name in protocols if name.startswith("single"))  # what every row has; its size follows
     cells, marked = [], []
     for row in ROWS:
         state = json.loads((out / row.run / "checkpoints" / "last" / "state.json").read_text())["state"]
@@ -218,7 +220,7 @@ def ending(out: Path, seconds: float) -> None:
         known = [found[row.run].get(protocol) for protocol in protocols]
         cells.append([row.run, row.what, *(f"{r['1']:.1f} / {r['5']:.1f}" if r else "as single" for r in known), added])
     for column, protocol in enumerate(protocols):
-        values = [found[row.run].get(protocol, found[row.run]["single"])["1"] for row in ROWS]
+        values = [found[row.run].get(protocol, found[row.run][alone])["1"] for row in ROWS]
         marked += [
             (k, column + 2) for k, value in enumerate(values) if value == max(values) and protocol in found[ROWS[k].run]
         ]

@@ -75,7 +75,8 @@ def _run(module: str, arguments: list[str], output: Path, environment: dict[str,
 
     AcceleratorState._reset_state(True)  # what an earlier test in the parent launched is not what this process is
     PartialState._reset_state()
-    torch.set_num_threads(1)  # OpenMP's threads do not survive a fork
+    torch.set_num_threads(1)  # OpenMP's threads do not survive a fork; so the search must find one core, too
+    os.sched_getaffinity = lambda pid: {0}
     os.environ["OMP_NUM_THREADS"] = "1"
     job = importlib.import_module(module)
     sys.modules["__main__"] = job

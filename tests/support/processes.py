@@ -48,7 +48,12 @@ def run_ranks(function: Callable[..., Any], world: int, *arguments: Any, timeout
 
 
 def _rank(function: Callable[..., Any], arguments: tuple[Any, ...], r: int, world: int, folder: Path) -> None:
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # OpenMP's threads do not survive a fork; so a search must find one core, too
+    os.sched_getaffinity = lambda pid: {0}
+    from accelerate.state import AcceleratorState, PartialState
+
+    AcceleratorState._reset_state(True)  # what an earlier test in the parent launched is not what this process is
+    PartialState._reset_state()
     os.environ |= {"RANK": str(r), "LOCAL_RANK": str(r), "WORLD_SIZE": str(world)}
     try:
         dist.init_process_group(
