@@ -48,8 +48,8 @@ def main() -> None:
         compare_evaluations(job)
         return
     from pipeline.evaluation.report.figures import also_as
-    from pipeline.training import comparison
-    from pipeline.training.tracking import store_uri
+    from pipeline.training.records import comparison
+    from pipeline.training.records.tracking import store_uri
 
     runs = comparison.load_runs(store_uri(job.uri, job.output), job.experiment, job.runs)
     table = comparison.table(runs)

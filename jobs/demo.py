@@ -235,7 +235,7 @@ def ending(out: Path, seconds: float) -> None:
     for path in [*sorted((out / "images").glob("*")), *sorted(out.glob("comparison/*.png")), *reports]:
         print(f"  {path}")
     print("\nEvery run, curve and checkpoint in MLflow:")
-    from pipeline.training.tracking import how_to_open
+    from pipeline.training.records.tracking import how_to_open
 
     where = how_to_open(f"sqlite:///{out}/mlflow.db")
     print("  " + where.replace(" mlflow ui", " .venv/bin/mlflow ui"))

@@ -116,7 +116,7 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
         title = f"Evaluation of {(runs[0] if runs else file).name}"
         write_page(results, pictures, output / "report.html", title, facts)
     if job.track and runs:
-        from pipeline.training.tracking import record_evaluation
+        from pipeline.training.records.tracking import record_evaluation
 
         values = {name: value for entry in tables.as_dicts(results) for name, value in entry["metrics"].items()}
         record_evaluation(runs[0], read_metadata(file)["extra"], values, output)

@@ -57,7 +57,7 @@ def main() -> None:
 
         outcome = try_out(config, accelerator) if job.fast_dev_run else train(config, accelerator)
         if first:
-            from pipeline.training.run_log import FEWEST, draw
+            from pipeline.training.records.run_log import FEWEST, draw
 
             picture = draw(outcome.run, STEPS if job.fast_dev_run else FEWEST)
             print(f"{outcome.run}: {outcome}", flush=True)

@@ -78,7 +78,7 @@ def measure(order: Path, accelerator: Any) -> None:
 
 
 def _keep(run: Path, path: Path, file: Path, config: EvaluationConfig, results: Sequence[Result]) -> None:
-    from pipeline.training.tracking import record_evaluation
+    from pipeline.training.records.tracking import record_evaluation
 
     temporary = path.with_suffix(".part")
     tables.write_json(results, temporary, {"checkpoint": str(file), "evaluation": to_dict(config)})

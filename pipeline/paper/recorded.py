@@ -14,7 +14,7 @@ from pipeline.evaluation.protocol import metric_name
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.paper.plan import Cell, Training
 from pipeline.paper.runner import Recalls
-from pipeline.training.tracking import open_client, store_uri
+from pipeline.training.records.tracking import open_client, store_uri
 
 
 def recorded(training: Training, cells: Sequence[Cell], sets: Mapping[str, EvaluationSet]) -> dict[str, Recalls]:

@@ -48,13 +48,13 @@ from pipeline.training.engines.build import build_engine, choose
 from pipeline.training.initialise import initialise, random_and_frozen
 from pipeline.training.launch import notice_of, stop_at, stop_signals
 from pipeline.training.loss import MultiSimilarityLoss
-from pipeline.training.meter import Meter
 from pipeline.training.mining import Mining
 from pipeline.training.numerics import full_float32, set_numerics
-from pipeline.training.run_folder import working_in
-from pipeline.training.run_log import RunLog
+from pipeline.training.records.meter import Meter
+from pipeline.training.records.run_folder import working_in
+from pipeline.training.records.run_log import RunLog
+from pipeline.training.records.tracking import Tracker
 from pipeline.training.schedule import build_optimizer, learning_rate
-from pipeline.training.tracking import Tracker
 from pipeline.training.validation import Validation
 from shards.index import ShardIndex
 

@@ -14,7 +14,7 @@ from typing import Any
 from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig
 from pipeline.distributed import on_rank_0, world_size
-from pipeline.training.run_folder import state_of
+from pipeline.training.records.run_folder import state_of
 from pipeline.training.trainer import Outcome, check_batch, train
 
 SUFFIX = "-fast-dev-run"

@@ -30,7 +30,7 @@ from safetensors.torch import load_file
 from tiny import make_evaluation, make_gsv, prepare, run_settings
 
 from pipeline.data.plan import plan
-from pipeline.training.run_folder import state_of
+from pipeline.training.records.run_folder import state_of
 from shards.index import read_index
 
 SOON = 15.0  # seconds in which every process of a killed job is gone

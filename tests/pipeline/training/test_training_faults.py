@@ -34,8 +34,9 @@ from tiny import prepare, run_settings
 from pipeline.common.errors import UsageError, UserError
 from pipeline.config import EvaluationConfig, ModelConfig, RunConfig, from_dict
 from pipeline.distributed import rank
-from pipeline.training import checkpoint, run_folder
+from pipeline.training import checkpoint
 from pipeline.training.launch import asked_processes, stop_signals
+from pipeline.training.records import run_folder
 from shards.index import read_index
 
 
@@ -88,7 +89,7 @@ def ended(config: RunConfig, fault: Callable[[], Any] | None = None) -> tuple[in
     """A training in the group that is there: (code, message, seconds)."""
     from accelerate import Accelerator
 
-    from pipeline.training.run_folder import working_in
+    from pipeline.training.records.run_folder import working_in
     from pipeline.training.trainer import Trainer
 
     # what a launcher sets; the group itself is there already

@@ -14,7 +14,7 @@ from pipeline.data.positions import points
 from pipeline.distributed import rank_slice, world_size
 from pipeline.training.checkpoint import RunState
 from pipeline.training.loss import MultiSimilarityLoss
-from pipeline.training.meter import Meter
+from pipeline.training.records.meter import Meter
 from pipeline.training.trainer import mined_metrics
 
 

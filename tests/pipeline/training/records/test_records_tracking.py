@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig
-from pipeline.training.tracking import Tracker
+from pipeline.training.records.tracking import Tracker
 
 
 def test_deleted_records_and_the_working_directory(

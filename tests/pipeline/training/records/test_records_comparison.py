@@ -10,8 +10,8 @@ import pytest
 
 from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig, TrackingConfig
-from pipeline.training import comparison
-from pipeline.training.tracking import Tracker, store_uri
+from pipeline.training.records import comparison
+from pipeline.training.records.tracking import Tracker, store_uri
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ from PIL import Image
 
 from pipeline.common.errors import UsageError
 from pipeline.config import BackboneConfig, RunConfig, changed
-from pipeline.training.comparison import load_runs
-from pipeline.training.run_log import FEWEST, PICTURE, RunLog, draw, read
-from pipeline.training.tracking import code_commit, how_to_open
+from pipeline.training.records.comparison import load_runs
+from pipeline.training.records.run_log import FEWEST, PICTURE, RunLog, draw, read
+from pipeline.training.records.tracking import code_commit, how_to_open
 
 
 def test_a_continued_run_has_every_step_once(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from processes import free_port
 
 from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig, TrackingConfig
-from pipeline.training.tracking import Tracker, open_client
+from pipeline.training.records.tracking import Tracker, open_client
 
 pytestmark = pytest.mark.slow  # a server takes ten seconds to start
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from pipeline.common.errors import UsageError
 from pipeline.common.text import Table
-from pipeline.training.tracking import open_client
+from pipeline.training.records.tracking import open_client
 
 RECALL = re.compile(r"^(?P<kind>\w+)/(?P<set>.+)\.(?P<protocol>[^.]+)\.recall_at_(?P<k>\d+)$")
 # where runs are recorded, how often and how fast, not what they are
