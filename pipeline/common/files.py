@@ -53,12 +53,32 @@ def locked(path: Path, refusal: str = "", patience: float = 0.0) -> Iterator[Non
 def write_atomically(path: Path, data: bytes, temporary: Path | None = None) -> None:
     """Writes a small file so that it is either whole under its name or not there at all, even if the power fails."""
     temporary = temporary or path.with_name(path.name + ".tmp")
-    with temporary.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.rename(path)
+    try:
+        with temporary.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        temporary.rename(path)
+    except OSError:
+        temporary.unlink(missing_ok=True)  # a full disk needs the room
+        raise
     sync_path(path.parent)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Gives a name beside `path` to write a file under, which then takes the place of `path` in one step.
+
+    Its folder is made where it is missing. Where writing fails nothing is left behind, and `path` stays as it was.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        yield partial
+        usual_permissions(partial)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def sha256_of(path: Path) -> str:

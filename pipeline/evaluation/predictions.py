@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.common.errors import DataError
+from pipeline.common.files import replacing
 from pipeline.common.text import shown
 from pipeline.evaluation.evaluate import Result
 from pipeline.evaluation.protocol import Protocol, read_protocol
@@ -63,11 +64,9 @@ def save_predictions(result: Result, evaluated: EvaluationSet, folder: Path) -> 
             "rank": pa.array(first_hits(result.predictions, evaluated.positives)),
         }
     ).replace_schema_metadata({META: json.dumps(about)})
-    folder.mkdir(parents=True, exist_ok=True)
     path = predictions_path(folder, result)
-    fresh = path.with_name(path.name + ".tmp")
-    pq.write_table(table, fresh, compression="zstd")
-    fresh.replace(path)
+    with replacing(path) as fresh:
+        pq.write_table(table, fresh, compression="zstd")
     return path
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pipeline.common.errors import DataError
-from pipeline.common.files import usual_permissions
+from pipeline.common.files import replacing
 
 FILE = "bank.safetensors"
 FORMAT = "place-bank 1"
@@ -54,10 +54,8 @@ def save_bank(bank: Bank, path: Path) -> None:
     """Writes one safetensors file; replaces `path` in one step."""
     from safetensors.torch import save_file
 
-    partial = path.with_name(f".{path.name}.partial")
-    save_file({"regions": bank.regions.contiguous()}, partial, {"format": FORMAT, "source": bank.source})
-    usual_permissions(partial)
-    partial.replace(path)
+    with replacing(path) as partial:
+        save_file({"regions": bank.regions.contiguous()}, partial, {"format": FORMAT, "source": bank.source})
 
 
 def bank_beside(weights: Path) -> Path:

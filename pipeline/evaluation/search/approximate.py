@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.common.errors import DataError, UsageError
+from pipeline.common.files import replacing
 from pipeline.evaluation.search.exact import QUERIES, Blocks, float32
 
 
@@ -79,10 +80,8 @@ def save_index(index: Any, path: Path) -> None:
     """Writes an index so that a reader never sees half of it."""
     import faiss
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_name(path.name + ".tmp")
-    faiss.write_index(index, str(fresh))
-    fresh.replace(path)
+    with replacing(path) as fresh:
+        faiss.write_index(index, str(fresh))
 
 
 def load_index(path: Path) -> Any:

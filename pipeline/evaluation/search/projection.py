@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from pipeline.common.errors import DataError, UsageError
-from pipeline.common.files import usual_permissions
+from pipeline.common.files import replacing
 from pipeline.evaluation.search.cores import all_cores
 from pipeline.evaluation.search.exact import Blocks
 
@@ -65,12 +65,9 @@ class Projection:
         from safetensors.torch import save_file
 
         about = {"explained": self.explained, "rows": self.rows, "whiten": self.whiten, "source": self.source}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = path.with_name(path.name + ".tmp")
         tensors = {"mean": self.mean, "components": self.components.contiguous(), "variances": self.variances}
-        save_file(tensors, str(fresh), metadata={"projection": json.dumps(about)})
-        usual_permissions(fresh)
-        fresh.replace(path)
+        with replacing(path) as fresh:
+            save_file(tensors, str(fresh), metadata={"projection": json.dumps(about)})
 
 
 def load_projection(path: Path) -> Projection:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.common.errors import DataError
+from pipeline.common.files import replacing
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet, list_images
 from pipeline.evaluation.sets.fixed_lists import existing
@@ -250,10 +251,8 @@ def export_predictions(loaded: EvaluationSet, predictions: np.ndarray, path: Pat
         " ".join([_key(query), *(keys[row] for row in found if row >= 0)])
         for query, found in zip(loaded.queries, rows.tolist(), strict=True)
     ]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    partial.replace(path)
+    with replacing(path) as partial:
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def read_predictions(loaded: EvaluationSet, path: Path) -> np.ndarray:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from pipeline.common.errors import DataError, UsageError
-from pipeline.common.files import usual_permissions
+from pipeline.common.files import replacing
 from pipeline.config import BackboneConfig, ModelConfig
 from pipeline.model.backbones.transformer import SIZES
 from pipeline.model.bank import bank_beside, save_bank
@@ -148,7 +148,8 @@ def write_model(model: PlaceModel, path: Path, source: str) -> None:
 
 def write_published(model: PlaceModel, path: Path) -> None:
     """A .pth of published names, tensors alone: what the published code's `load_state_dict` takes."""
-    _replaced(path, lambda partial: torch.save(to_published(model.state_dict()), partial))
+    with replacing(path) as partial:
+        torch.save(to_published(model.state_dict()), partial)
 
 
 def write_backbone(source: str, config: BackboneConfig, path: Path) -> dict[str, Tensor]:
@@ -160,14 +161,11 @@ def write_backbone(source: str, config: BackboneConfig, path: Path) -> dict[str,
     from safetensors.torch import save_file
 
     tensors = _checked(source, config)
-
-    def write(partial: Path) -> None:
+    with replacing(path) as partial:
         save_file(tensors, partial, {"format": "pt", "backbone": config.name})
         again = _checked(str(partial), config)
         if any(not torch.equal(again[name], tensor) for name, tensor in tensors.items()):
             raise DataError(f"{path}: differs when it is read back; check the disk")
-
-    _replaced(path, write)
     return tensors
 
 
@@ -184,15 +182,3 @@ def _checked(source: str, config: BackboneConfig) -> dict[str, Tensor]:
     backbone = build_model(plain, size if config.name != "custom" else config.patch * 4).backbone
     own = to_published({f"backbone.{name}": tensor for name, tensor in backbone.state_dict().items()})
     return {name.removeprefix("backbone."): tensor for name, tensor in own.items()}
-
-
-def _replaced(path: Path, write: Callable[[Path], object]) -> None:
-    """Writes beside `path` and replaces it in one step."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{path.name}")
-    try:
-        write(partial)
-        usual_permissions(partial)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

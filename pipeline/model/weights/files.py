@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pipeline.common.errors import DataError, UsageError
-from pipeline.common.files import sha256_of, usual_permissions
+from pipeline.common.files import replacing, sha256_of
 from pipeline.config import ModelConfig, from_dict, to_dict
 from pipeline.model.bank import bank_beside, read_bank
 from pipeline.model.vpr import PlaceModel, build_model
@@ -134,12 +134,8 @@ def save_model(
         "backbone_hash": backbone_hash or frozen_hash(model),
         "extra": json.dumps(extra or {}),
     }
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    save_file(to_published({name: tensors[name] for name in names}), partial, metadata)
-    usual_permissions(partial)
-    partial.replace(path)
+    with replacing(Path(path)) as partial:
+        save_file(to_published({name: tensors[name] for name in names}), partial, metadata)
 
 
 def read_metadata(path: str | Path) -> dict[str, Any]:

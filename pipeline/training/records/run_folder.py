@@ -21,7 +21,7 @@ from types import FrameType
 from typing import Any
 
 from pipeline.common.errors import DataError, Diverged, Interrupted, Preempted, UsageError, UserError, told
-from pipeline.common.files import locked
+from pipeline.common.files import locked, write_atomically
 from pipeline.distributed import held_on_rank_0, lost, rank, world_size
 
 STATUS, LOCK = "status.json", ".lock"
@@ -164,13 +164,8 @@ def _refused(run: Path, error: OSError) -> UserError:
 def _write(path: Path, status: Status) -> None:
     """Whole or not at all."""
     path.with_name(ROOM).unlink(missing_ok=True)  # on a full disk, the room for what follows
-    temporary = path.with_name(f".status-{os.getpid()}")
-    try:
-        temporary.write_text(json.dumps(asdict(status), indent=1) + "\n")
-        temporary.replace(path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
+    data = (json.dumps(asdict(status), indent=1) + "\n").encode()
+    write_atomically(path, data, path.with_name(f".status-{os.getpid()}"))
 
 
 def _now() -> str:
