@@ -42,9 +42,9 @@ def place_model(
     Raises:
         UsageError: nothing there, or weights that do not fit; DataError: a broken file.
     """
-    import pipeline
+    from pipeline.model.weights.convert import read_whole  # not pipeline.api: a hub user has no evaluation packages
 
-    model = pipeline.load_model(path, device, image_size).module
+    model = read_whole(path, image_size).to(device).eval()
     if not bank or model.bank is None:
         return model
     from pipeline.model.beside import BesideBank
@@ -95,7 +95,7 @@ def _entry(name: str) -> Callable[..., PlaceModel | BesideBank]:
     return build
 
 
-def _variants() -> dict[str, Callable[..., PlaceModel]]:
+def _variants() -> dict[str, Callable[..., PlaceModel | BesideBank]]:
     from pipeline.model.variants import VARIANTS
 
     return {name: _entry(name) for name in VARIANTS}

@@ -76,14 +76,14 @@ def main() -> None:
 def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None:
     """The evaluation on this process; rank 0 writes."""
     from pipeline.distributed import on_rank_0
-    from pipeline.evaluation.evaluate import evaluate, fit_projections
+    from pipeline.evaluation.evaluate import evaluate, projections_from
     from pipeline.evaluation.identity import model_digest
     from pipeline.evaluation.predictions import save_results
     from pipeline.evaluation.report import tables
     from pipeline.evaluation.report.figures import also_as
     from pipeline.evaluation.report.page import write_page
     from pipeline.evaluation.report.pictures import draw
-    from pipeline.evaluation.sets.load import available, load_set, load_sets
+    from pipeline.evaluation.sets.load import available, load_sets
     from pipeline.model.weights.files import checkpoint_file, read_metadata
     from pipeline.model.weights.load import load_any
 
@@ -98,10 +98,7 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
         print(f"left out: {line}", file=sys.stderr)
     model = load_any(file, device)
     fingerprint = model_digest(model)
-    projections = None
-    if config.pca and config.pca_from:
-        source = load_set(config.pca_from, dataclasses.replace(config, split="train"))
-        projections = fit_projections(model, source, config, device, beside=file.parent, fingerprint=fingerprint)
+    projections = projections_from(model, config, device, beside=file.parent, fingerprint=fingerprint)
     results = evaluate(model, sets, config, device, output, True, projections, fingerprint)
     if not first:
         return

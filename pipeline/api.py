@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from pipeline.common.errors import UsageError
-from pipeline.config import EvaluationConfig, ModelConfig, RunConfig
+from pipeline.config import EvaluationConfig, RunConfig
 from pipeline.evaluation import evaluate as evaluation
 from pipeline.evaluation.describe.bank import chosen_bank
 from pipeline.evaluation.describe.encode import evaluating
@@ -32,7 +32,7 @@ from pipeline.evaluation.protocol import Side, protocols
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet, list_images
 from pipeline.evaluation.sets.load import load_set
 from pipeline.model.vpr import PlaceModel
-from pipeline.model.weights.convert import kind_of, read_model
+from pipeline.model.weights.convert import read_whole
 
 if TYPE_CHECKING:
     from pipeline.training.trainer import Outcome
@@ -112,13 +112,8 @@ def load_model(path: str | Path, device: torch.device | str | None = None, image
     Raises:
         UsageError: nothing there, or weights that do not fit; DataError: a broken file.
     """
-    kind = kind_of(str(path))
-    if kind == "backbone":
-        raise UsageError(f"{path}: a backbone alone; `jobs.weights --variant NAME --to FILE` makes it a whole model")
-    if device is None:
-        device = "cuda" if torch.cuda.is_available() else "cpu"
-    device = torch.device(device)
-    return Model(read_model(str(path), kind, ModelConfig(), image_size).to(device).eval(), device)
+    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    return Model(read_whole(str(path), image_size).to(device).eval(), device)
 
 
 def evaluate(
@@ -147,10 +142,7 @@ def evaluate(
     loaded = [load_set(name, config) for name in ([sets] if isinstance(sets, str) else sets)]
     model = model if isinstance(model, Model) else load_model(model)
     folder = None if output is None else Path(output)
-    projections = None
-    if config.pca and config.pca_from:
-        source = load_set(config.pca_from, dataclasses.replace(config, split="train"))
-        projections = evaluation.fit_projections(model.module, source, config, model.device, progress)
+    projections = evaluation.projections_from(model.module, config, model.device, progress)
     return evaluation.evaluate(model.module, loaded, config, model.device, folder, progress, projections)
 
 

@@ -34,6 +34,7 @@ from pipeline.evaluation.search.exact import Blocks, batches, search, search_wit
 from pipeline.evaluation.search.projection import Projection, fit_rows, load_projection, projected, sample_rows
 from pipeline.evaluation.search.rerank import PatchTokens, rerank
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
+from pipeline.evaluation.sets.load import load_set
 
 SIDES: tuple[Side, Side] = ("database", "queries")
 
@@ -75,7 +76,7 @@ def evaluate(
         model: a `PlaceModel`, or the wrapper that holds one as `.module`; left in the mode it came in.
         output: folder of the descriptor store (`config.store`) and of what is too large for memory.
         progress: show bars on rank 0.
-        projections: protocol name without PCA -> PCA fitted before (`projection.fit_projections`); needed where
+        projections: protocol name without PCA -> PCA fitted before (`fit_projections`); needed where
             `config.pca_from` names a set; otherwise PCA is fitted on each set's own database.
         fingerprint: `identity.model_digest` of the model; None computes it where `output` needs it.
 
@@ -90,9 +91,11 @@ def evaluate(
     with _alone_in(output), evaluating(model), tempfile.TemporaryDirectory() as temporary:
         engine = Engine(model, config, device, output, Path(temporary), progress, fingerprint or "")
         tokens = PatchTokens(model, config, device) if config.rerank else None
+        bank = None
         for evaluated in sets:
             same(_names_digest(evaluated), f"the digest of the photo names of {evaluated.name}")
-            bank = chosen_bank(model, config, evaluated.database, device)
+            if bank is None or config.bank_from == "map":  # only that one is another for each set
+                bank = chosen_bank(model, config, evaluated.database, device)
             chosen = protocols(config, engine.model.image_size, evaluated.rule, bank)
             sides = {side: engine.side(evaluated, side, chosen, bank) for side in SIDES}
             for protocol in chosen:
@@ -118,6 +121,21 @@ def _alone_in(output: Path | None) -> AbstractContextManager[None]:
 def _names_digest(evaluated: EvaluationSet) -> str:
     names = "\n".join(path.name for path in (*evaluated.database, *evaluated.queries))
     return hashlib.sha256(names.encode(errors="surrogateescape")).hexdigest()[:16]
+
+
+def projections_from(
+    model: nn.Module,
+    config: EvaluationConfig,
+    device: torch.device | str,
+    progress: bool = True,
+    beside: Path | None = None,
+    fingerprint: str = "",
+) -> dict[str, Projection] | None:
+    """`fit_projections` on the set that `config.pca_from` names; None where it names none, or there is no PCA."""
+    if not config.pca or not config.pca_from:
+        return None
+    source = load_set(config.pca_from, dataclasses.replace(config, split="train"))
+    return fit_projections(model, source, config, device, progress, beside, fingerprint)
 
 
 def fit_projections(
@@ -239,7 +257,7 @@ def score(
 ) -> Result:
     """Predictions [Q, k] -> the result, without recalls where the set has no ground truth."""
     recalls: dict[int, float] = {}
-    if getattr(evaluated, "has_ground_truth", True):
+    if evaluated.has_ground_truth:
         recalls = recall_at(
             predictions, evaluated.positives, config.recalls, without_positives=config.without_positives
         )

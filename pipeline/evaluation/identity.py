@@ -30,7 +30,8 @@ class Identity:
     """Names one result."""
 
     of: str
-    """What it is: "database", "queries" (descriptors of a side), "regions", "pca", "photos"."""
+    """What it is: "database", "queries" (descriptors of a side), "regions", "pca", "photos" (an index), "photo" (one
+    photo)."""
     model: str
     """`model_digest`."""
     files: str

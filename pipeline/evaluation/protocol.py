@@ -19,6 +19,10 @@ from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
 from pipeline.model.bank import Bank
 
+METRIC = re.compile(
+    r"(?P<kind>\w+)/(?P<set>.+)\.(?P<protocol>(?:single|shuffled|ordered|bank).*)\.recall_at_(?P<k>\d+)"
+)
+
 Side = Literal["database", "queries"]
 WORD = 40  # characters of a value in a protocol's name
 
@@ -42,7 +46,7 @@ class Protocol:
     """How descriptors were computed and compared (paper, section 4.1, and the batch that its code implies).
 
     Invariant: protocols that differ have different names, because the name is made of all fields that differ from
-    their defaults.
+    their defaults. Only the digest of a bank is not in the name; it is in the `Identity` of what is kept.
     """
 
     groups: str = named("{}", "descriptors")
@@ -186,3 +190,12 @@ def _word(value: Any) -> str:
 def metric_name(set_name: str, protocol: Protocol, k: int) -> str:
     """`<set>.<protocol>.recall_at_<k>`: MLflow accepts no '@' in names."""
     return f"{set_name}.{protocol.name}.recall_at_{k}"
+
+
+def read_metric_name(name: str) -> tuple[str, str, str, int] | None:
+    """(kind, set, protocol's name, k) of `<kind>/` and a `metric_name`, as MLflow holds it; None for other metrics.
+
+    Names of sets and protocols may hold points; a protocol's name begins with its grouping.
+    """
+    found = METRIC.fullmatch(name)
+    return None if found is None else (found["kind"], found["set"], found["protocol"], int(found["k"]))

@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.common.errors import DataError
-from pipeline.common.files import sync_path
+from pipeline.common.files import reserve, sync_path
 from pipeline.evaluation.search.exact import Blocks, slices
 
 META = b"place_recognition_photos"
@@ -93,7 +93,8 @@ class KeptDescriptors:
                     array = np.empty(shape, np.float32)
                 else:
                     file = tempfile.NamedTemporaryFile(dir=temporary, delete=False)  # noqa: SIM115
-                    array = np.memmap(file, np.float32, mode="w+", shape=shape)
+                    reserve(Path(file.name), shape[0] * shape[1] * 4)
+                    array = np.memmap(file, np.float32, mode="r+", shape=shape)
             here = np.flatnonzero(parts == number)
             array[here] = values[rows[here]]
         assert array is not None  # an index has at least one photo

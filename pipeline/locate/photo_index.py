@@ -5,7 +5,8 @@ to be: grown or built at once, it gives the same answers, to the last bit where 
 (`config.batch` 1). It is replaced by one rename: a build that dies leaves the former index answering, and the next
 build continues behind it. An index knows its weights and protocol, and is refused beside others.
 
-An index is a folder: `described/`, the descriptors of single photos (`kept.py`); `index-<number>/` with `index.faiss`,
+An index is a folder: `described/`, the descriptors of single photos (`descriptor_cache`); `index-<number>/` with
+`index.faiss`,
 `photos.parquet` (`photo`, relative to `root` of `about.json` where it is below it, `bytes`, `modified`, and `first`,
 `second`, `lat`, `lon`, its coordinates or null), `calibration.json` (`no_match`), and `pca.safetensors` where PCA was
 asked for; and `about.json`, which names the number: without it there is no index.

@@ -1,8 +1,8 @@
 """The figure of a table: bars for rows that are names, lines for rows that are numbers; ours and the paper's.
 
-Invariant: a panel is one set, its protocols in its legend; bars and lines are means over seeds, the dots on bars and
-the bars on lines are the seeds and their standard deviation; the
-paper's figures are hollow, and drawn only where they are for the same set.
+Invariant: a panel is one set, its protocols in its legend. A bar or a line shows the mean over seeds; dots on a bar are
+the seeds, and a vertical stroke on a line is their standard deviation. The paper's figures are hollow, and drawn only
+where they are for the same set.
 """
 
 from __future__ import annotations

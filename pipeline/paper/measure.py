@@ -6,7 +6,6 @@ repeated, one that was cut short leaves nothing half-written.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import EvaluationConfig, from_dict, to_dict
-from pipeline.evaluation.evaluate import Result, evaluate, fit_projections
+from pipeline.evaluation.evaluate import Result, evaluate, projections_from
 from pipeline.evaluation.identity import model_digest
 from pipeline.evaluation.predictions import save_predictions
 from pipeline.evaluation.report import tables
@@ -60,12 +59,7 @@ def measure(order: Path, accelerator: Any) -> None:
     fingerprint = model_digest(model)
     configs = {key: from_dict(EvaluationConfig, values) for key, values in told["evaluations"].items()}
     for key, config in configs.items():
-        projections = None
-        if config.pca and config.pca_from:
-            source = load_set(config.pca_from, dataclasses.replace(config, split="train"))
-            projections = fit_projections(
-                model, source, config, accelerator.device, beside=file.parent, fingerprint=fingerprint
-            )
+        projections = projections_from(model, config, accelerator.device, beside=file.parent, fingerprint=fingerprint)
         sets = [load_set(name, config) for name in config.sets]
         results = evaluate(model, sets, config, accelerator.device, output, True, projections, fingerprint)
         if accelerator.is_main_process:

@@ -199,8 +199,6 @@ def _label(config: RunConfig, base: RunConfig) -> str:
         parts.append(f"steps{config.train.steps}")
     elif config.train.epochs != base.train.epochs:
         parts.append(f"epochs{config.train.epochs}")
-    if config.train.passes != base.train.passes:
-        parts.append(config.train.passes)
     return "-".join(parts)
 
 

@@ -75,12 +75,13 @@ class Validation:
     def run(self, model: nn.Module, show: bool) -> tuple[dict[str, float], float]:
         """Recalls by metric name, and the score; collective, the same on every rank."""
         from pipeline.evaluation.evaluate import evaluate
+        from pipeline.evaluation.protocol import metric_name
 
         results = evaluate(model, self.sets, self.config, self.device)
         values: dict[str, float] = {}
         for result in results:
-            prefix = f"validation/{result.set_name}.{result.protocol.name}"
-            values |= {f"{prefix}.recall_at_{k}": value for k, value in result.recalls.items()}
+            for k, value in result.recalls.items():
+                values["validation/" + metric_name(result.set_name, result.protocol, k)] = value
             if show:
                 recalls = "  ".join(f"R@{k} {value:.1f}" for k, value in result.recalls.items())
                 print(f"validation  {result.set_name}  {result.protocol.name}  {recalls}", file=sys.stderr, flush=True)

@@ -147,11 +147,10 @@ def encode(
         model: has `encode(images [b, 3, S, S]) -> [b, R, D]`, `regions`, `descriptor_dim` and `image_size`.
         wanted: for each grouping, the blocks that will be correlated; a rank keeps what its groups in them need.
         scratch: folder for the regions of sets too large for memory; None: memory alone.
-        fixed: fill the last forward batch up, so that all have `config.batch` images and none rounds otherwise.
         key: digest of what the regions depend on (`Identity`); a file in `scratch` left by a killed run with the same
             key and batch is continued: its progress is counted in batches.
-
         beyond: photos that will be described next; where one of `paths` is broken, these are looked through too.
+        fixed: fill the last forward batch up, so that all have `config.batch` images and none rounds otherwise.
 
     Raises:
         DataError: images that cannot be read, all of them (`broken_photos`), on all ranks alike.

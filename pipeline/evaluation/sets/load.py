@@ -29,7 +29,7 @@ TABLES = (".npy", ".npz", ".mat", ".csv", ".parquet")  # files that may say what
 def load_set(name_or_path: str, config: EvaluationConfig) -> EvaluationSet:
     """The evaluation set `name_or_path`.
 
-    A name of `published.SETS`, however it is written (`Tokyo24/7`, `svox-night`, `nordland**`), is looked up below
+    A name of `registry.SETS`, however it is written (`Tokyo24/7`, `svox-night`, `nordland**`), is looked up below
     `config.root`. A path may be a folder in any layout (the dataset's or the one holding database/ and queries/), a
     CSV or Parquet manifest, or the folder or a file of fixed `.npy` lists. `gardens_point:day_right->night_right`
     (queries->database) chooses the traverses of a walk. Raises `DataError` for what is missing or malformed,
@@ -257,10 +257,9 @@ def available(root: str, split: str = "test") -> list[Availability]:
     found = []
     known: set[Path | None] = set()
     for name in SETS:
-        folder = _find(root, name, split)
-        if folder is not None and not _is_there(name, folder, split):
-            folder = None
-        known |= {folder, _find(root, name, split)}
+        there = _find(root, name, split)
+        known.add(there)
+        folder = there if there is not None and _is_there(name, there, split) else None
         found.append(Availability(name, folder, _missing(name, root, split).partition("expected ")[2]))
     for folder in sorted(below.iterdir()) if below.is_dir() else []:
         if folder.is_dir() and folder not in known and layouts.split_folder(folder, split) is not None:

@@ -84,6 +84,18 @@ def read_model(source: str, kind: str, config: ModelConfig, image_size: int | No
     return from_published(tensors, source, image_size or PUBLISHED_SIZE, config)
 
 
+def read_whole(path: str, image_size: int | None) -> PlaceModel:
+    """`read_model` of whatever whole model lies at a path.
+
+    Raises:
+        UsageError: nothing there, a backbone alone, or weights that do not fit; DataError: broken.
+    """
+    kind = kind_of(path)
+    if kind == "backbone":
+        raise UsageError(f"{path}: a backbone alone; `jobs.weights --variant NAME --to FILE` makes it a whole model")
+    return read_model(path, kind, ModelConfig(), image_size)
+
+
 def at_size(model: PlaceModel, image_size: int) -> PlaceModel:
     """The same weights for inputs of another side, in eval mode."""
     bare = dataclasses.replace(model.config, backbone=dataclasses.replace(model.config.backbone, weights=None))

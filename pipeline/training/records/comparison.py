@@ -6,7 +6,6 @@ different protocols are different rows, never averaged or mixed.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +13,9 @@ from typing import Any
 
 from pipeline.common.errors import UsageError
 from pipeline.common.text import Table
+from pipeline.evaluation.protocol import read_metric_name
 from pipeline.training.records.tracking import open_client
 
-RECALL = re.compile(r"^(?P<kind>\w+)/(?P<set>.+)\.(?P<protocol>[^.]+)\.recall_at_(?P<k>\d+)$")
 # where runs are recorded, how often and how fast, not what they are
 UNINTERESTING = (
     "name", "output", "tracking.", "data.workers", "data.prefetch", "data.cache", "validate.workers",
@@ -106,20 +105,19 @@ def metric_rows(runs: Sequence[Run]) -> list[tuple[str, list[float | None]]]:
     keys = {key for run in runs for key in run.metrics}
 
     def order(key: str) -> tuple[Any, ...]:
-        match = RECALL.match(key)
-        if match is None:
+        recall = read_metric_name(key)
+        if recall is None:
             return (2, key)
-        kinds = {"evaluation": 0, "validation": 1}
-        return (0, kinds.get(match["kind"], 2), match["set"], match["protocol"], int(match["k"]))
+        return (0, {"evaluation": 0, "validation": 1}.get(recall[0], 2), *recall[1:])
 
-    shown = [k for k in keys if RECALL.match(k) or k in ("train/loss", "train/images_per_second")]
+    shown = [k for k in keys if read_metric_name(k) or k in ("train/loss", "train/images_per_second")]
     return [(key, [run.metrics.get(key) for run in runs]) for key in sorted(shown, key=order)]
 
 
 def best(metric: str, values: Sequence[float | None]) -> set[int]:
     """Positions of the best value of a row where there is one: the highest recall, the lowest loss; else none."""
     present = [v for v in values if v is not None]
-    if len(present) < 2 or len(set(present)) < 2 or not (RECALL.match(metric) or metric == "train/loss"):
+    if len(present) < 2 or len(set(present)) < 2 or not (read_metric_name(metric) or metric == "train/loss"):
         return set()
     target = min(present) if metric == "train/loss" else max(present)
     return {i for i, v in enumerate(values) if v == target}
@@ -145,17 +143,17 @@ def draw_curves(runs: Sequence[Run], path: Path) -> bool:
     panels: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for run in runs:
         for key, value in run.metrics.items():
-            match = RECALL.match(key)
-            if match is not None and match["kind"] == "evaluation":
-                title = f"{match['set']}, {match['protocol']}"
-                panels.setdefault(title, {}).setdefault(run.name, []).append((int(match["k"]), value))
+            if (recall := read_metric_name(key)) is not None:
+                kind, set_name, protocol, k = recall
+                if kind == "evaluation":
+                    panels.setdefault(f"{set_name}, {protocol}", {}).setdefault(run.name, []).append((k, value))
     progress: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for run in runs:
         for key, points in run.history.items():
-            match = RECALL.match(key)
-            if match is not None and match["k"] == "5" and len(points) > 1:
-                title = f"validation {match['set']}, {match['protocol']}, R@5"
-                progress.setdefault(title, {})[run.name] = points
+            if (recall := read_metric_name(key)) is not None:
+                _, set_name, protocol, k = recall
+                if k == 5 and len(points) > 1:
+                    progress.setdefault(f"validation {set_name}, {protocol}, R@5", {})[run.name] = points
     if not panels and not progress:
         return False
     from pipeline.evaluation.report.figures import CURVES, canvas

@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.common.errors import UsageError
 from pipeline.config import RunConfig, TrackingConfig
+from pipeline.evaluation.protocol import read_metric_name
 from pipeline.training.records import comparison
 from pipeline.training.records.tracking import Tracker, store_uri
 
@@ -93,3 +94,16 @@ def test_a_store_that_cannot_be_reached_is_an_error_at_the_start(tmp_path: Path)
     config = RunConfig(output=str(tmp_path), tracking=TrackingConfig(uri="http://127.0.0.1:9"))
     with pytest.raises(UsageError, match=r"MLflow store http://127\.0\.0\.1:9 cannot be used"):
         Tracker(config)
+
+
+def test_names_of_sets_and_protocols_may_hold_points() -> None:
+    """A radius of 12.5 m and a folder called v1.2 stand in them; a metric's name is read back as it was made."""
+    for set_name, protocol in (
+        ("city", "single_12.5m"),
+        ("v1.2", "bank64photos.v2-0a1b2c"),
+        ("a.b", "ordered8_pca4096"),
+    ):
+        for k in (1, 10):
+            name = f"validation/{set_name}.{protocol}.recall_at_{k}"
+            assert read_metric_name(name) == ("validation", set_name, protocol, k)
+    assert read_metric_name("train/loss") is None and read_metric_name("evaluation/city.other.recall_at_1") is None
