@@ -7,7 +7,7 @@ ranks wait for it, so it may take all cores.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch
@@ -21,16 +21,18 @@ def all_cores(faiss: bool = False) -> Iterator[None]:
         yield
         return
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    before = torch.get_num_threads()
-    torch.set_num_threads(cores)
-    if faiss:  # it brings an OpenMP of its own
+    counts: list[tuple[Callable[[], int], Callable[[int], None]]] = [(torch.get_num_threads, torch.set_num_threads)]
+    if faiss:
         import faiss as library
 
-        before_faiss = library.omp_get_max_threads()
-        library.omp_set_num_threads(cores)
+        counts.append((library.omp_get_max_threads, library.omp_set_num_threads))
+    # torch and faiss share one OpenMP or bring one each, by the order of their imports. Shared, setting one changes the
+    # other: so both are read before either is set, and set back in the opposite order.
+    before = [read() for read, _ in counts]
+    for _, write in counts:
+        write(cores)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
-        if faiss:
-            library.omp_set_num_threads(before_faiss)
+        for (_, write), number in reversed(list(zip(counts, before, strict=True))):
+            write(number)
