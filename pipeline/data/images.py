@@ -33,6 +33,7 @@ except ImportError:  # Pillow decodes the same images at about 0.6 times the spe
 
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
+ADVICE = "; restore the file or leave it out"  # ends the line of a photo that cannot be read
 
 
 def decode(data: bytes) -> NDArray[np.uint8]:
@@ -50,9 +51,9 @@ def load_image(source: Path | str | bytes) -> Image.Image:
         return Image.fromarray(pixels) if pixels is not None else pictures.decode(data)
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
         told = error.strerror if isinstance(error, OSError) else error
-        raise DataError(f"{name}: cannot be read ({told or error}); restore the file or leave it out") from None
+        raise DataError(f"{name}: cannot be read ({told or error}){ADVICE}") from None
     except DataError as error:
-        raise DataError(f"{name}: {error}; restore the file or leave it out") from None
+        raise DataError(f"{name}: {error}{ADVICE}") from None
 
 
 def to_input(image: Image.Image, size: int, resize: Literal["antialias", "published"] = "antialias") -> Tensor:

@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.text import printable, shown
-from pipeline.data.images import load_image
+from pipeline.data.images import ADVICE, load_image
 from pipeline.locate.answers import Answer, Found, Locator
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def make_app(locator: Locator, count: int) -> Flask:
             with one_at_a_time:  # the model has one set of buffers, and the machine one user
                 found = locator.answer(Path(name), count, data)
         except DataError as error:
-            reason = str(error).removesuffix("; restore the file or leave it out")
+            reason = str(error).removesuffix(ADVICE)
             return render(problem=f"{name}: {reason}"), 400
         asked = f"data:image/jpeg;base64,{base64.b64encode(picture).decode()}"
         return render(name=name, answer=found, asked=asked, cards=cards(locator, found), map=drawn(locator, found))

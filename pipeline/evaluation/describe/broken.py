@@ -10,10 +10,9 @@ from pathlib import Path
 
 from pipeline.common.errors import DataError, told
 from pipeline.common.text import shown
-from pipeline.data.images import load_image
+from pipeline.data.images import ADVICE, load_image
 
 NAMED = 10  # photos named in the line
-ADVICE = "; restore the file or leave it out"
 
 
 def problem_of(photo: Path) -> str:
