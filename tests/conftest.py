@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+
+# One thread a process, also in the processes that tests start: another number of threads may round otherwise, so exact
+# comparisons would depend on the machine's cores. It counts until torch, NumPy and faiss are imported.
+os.environ["OMP_NUM_THREADS"] = "1"
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
