@@ -12,7 +12,6 @@ Invariant: nothing here computes anything of its own; a number from Python is th
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,8 +87,8 @@ class Model:
         nothing: list[np.ndarray] = [np.zeros(0, np.int64)] * len(paths)
         described = EvaluationSet("photos", paths, paths, nothing, "")
         found = np.empty((len(paths), self.descriptor_dim), np.float32)
-        with evaluating(self.module), tempfile.TemporaryDirectory() as folder:
-            engine = Engine(self.module, wanted, self.device, None, Path(folder), False, "")
+        with evaluating(self.module):
+            engine = Engine(self.module, wanted, self.device, None, False, "")
             bank = chosen_bank(self.module, wanted, paths, self.device)
             (protocol,) = protocols(wanted, self.module.image_size, "", bank)
             encoded = engine.side(described, side, [protocol], bank)

@@ -6,19 +6,19 @@ file, what to do - because the jobs print it as one line, without a traceback (`
 
 from __future__ import annotations
 
-from pipeline.common.text import printable
+from pipeline.common.text import message
 
 
 class UserError(Exception):
     """Base of the errors shown as one line; `exit_code` becomes the status of the process.
 
-    Its text is printable whatever names and values it quotes (`text.printable`).
+    Its text is one printable line of bearable length, whatever names and values it quotes (`text.message`).
     """
 
     exit_code = 2
 
     def __str__(self) -> str:
-        return printable(super().__str__())
+        return message(super().__str__())
 
 
 class UsageError(UserError):

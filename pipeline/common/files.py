@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 from pipeline.common.errors import UsageError
 from pipeline.common.text import shown
@@ -105,13 +105,29 @@ def check_writable(folder: Path, option: str) -> None:
 def reserve(path: Path, size: int) -> None:
     """Makes a file of `size` zero bytes that the disk really has: writing into a mapped hole of a full disk kills."""
     with path.open("wb") as file:
-        if hasattr(os, "posix_fallocate"):
-            try:
-                os.posix_fallocate(file.fileno(), 0, size)
-            except OSError as error:
-                raise OSError(error.errno, error.strerror, str(path)) from None
-        else:
-            file.truncate(size)
+        _take_room(file, size, path)
+
+
+def unnamed_file(size: int, folder: Path | None = None) -> IO[bytes]:
+    """As `reserve`, a file without a name: its room is free again when its last user ends, however that ends. A mapping
+    of it is a user. `folder`: on whose disk; None: the system's for temporary files."""
+    file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  the caller closes it
+    try:
+        _take_room(file, size, folder or Path(tempfile.gettempdir()))
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _take_room(file: IO[bytes], size: int, told: Path) -> None:
+    if not hasattr(os, "posix_fallocate"):
+        file.truncate(size)
+        return
+    try:
+        os.posix_fallocate(file.fileno(), 0, size)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(told)) from None
 
 
 def open_ordinary(path: Path) -> BinaryIO:

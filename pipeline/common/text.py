@@ -16,6 +16,7 @@ from dataclasses import dataclass
 # what markdown reads as markup; an underscore inside a word is not
 MARKUP = re.compile(r"[\\`*<>|\[\]~&]|(?<!\w)_|_(?!\w)")
 LIMIT = 200  # characters shown of a name or value in a message
+LONG = re.compile(r"(\S{500})\S+(\S{500})")  # in a whole message
 FORMULA = ("=", "+", "-", "@")
 
 
@@ -39,6 +40,11 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
+
+
+def message(text: str) -> str:
+    """A whole message as one printable line; a name of more than 1000 characters without a space loses its middle."""
+    return LONG.sub(r"\1...\2", printable(text))
 
 
 def markdown_text(text: str) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
@@ -88,8 +87,8 @@ def evaluate(
     if output is not None and fingerprint is None:
         fingerprint = model_digest(model)
     results: list[Result] = []
-    with _alone_in(output), evaluating(model), tempfile.TemporaryDirectory() as temporary:
-        engine = Engine(model, config, device, output, Path(temporary), progress, fingerprint or "")
+    with _alone_in(output), evaluating(model):
+        engine = Engine(model, config, device, output, progress, fingerprint or "")
         tokens = PatchTokens(model, config, device) if config.rerank else None
         bank = None
         for evaluated in sets:
@@ -193,8 +192,8 @@ def fit_projections(
     missing = on_rank_0(read)
     if not missing:
         return fitted
-    with evaluating(model), tempfile.TemporaryDirectory() as temporary:
-        engine = Engine(model, config, device, None, Path(temporary), progress, "")
+    with evaluating(model):
+        engine = Engine(model, config, device, None, progress, "")
         side = engine.side(sampled, "database", missing, bank)
         for protocol in missing:
             on_rank_0(partial(fit, side.describe(protocol), protocol))

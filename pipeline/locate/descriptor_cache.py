@@ -11,7 +11,6 @@ A folder of Parquet files `part-*.parquet` with the columns `photo`, `bytes`, `m
 from __future__ import annotations
 
 import json
-import tempfile
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.common.errors import DataError
-from pipeline.common.files import reserve, sync_path
+from pipeline.common.files import sync_path, unnamed_file
 from pipeline.evaluation.search.exact import Blocks, slices
 
 META = b"place_recognition_photos"
@@ -80,7 +79,7 @@ class KeptDescriptors:
             if waiting:
                 self._write(photos, states, waiting)
 
-    def blocks(self, addresses: Sequence[Address], temporary: Path) -> Blocks:
+    def blocks(self, addresses: Sequence[Address]) -> Blocks:
         """The descriptors at `addresses` in their order, one part in memory at a time, the whole where it is small."""
         parts, rows = np.array(addresses, np.int64).reshape(-1, 2).T
         files = self._parts()
@@ -92,9 +91,8 @@ class KeptDescriptors:
                 if shape[0] * shape[1] * 4 <= IN_MEMORY:
                     array = np.empty(shape, np.float32)
                 else:
-                    file = tempfile.NamedTemporaryFile(dir=temporary, delete=False)  # noqa: SIM115
-                    reserve(Path(file.name), shape[0] * shape[1] * 4)
-                    array = np.memmap(file, np.float32, mode="r+", shape=shape)
+                    with unnamed_file(shape[0] * shape[1] * 4, self.folder) as file:
+                        array = np.memmap(file, np.float32, mode="r+", shape=shape)
             here = np.flatnonzero(parts == number)
             array[here] = values[rows[here]]
         assert array is not None  # an index has at least one photo

@@ -19,7 +19,6 @@ import dataclasses
 import hashlib
 import json
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -156,21 +155,20 @@ def make_index(
             number = 1 + max((int(f.name[6:]) for f in folder.glob("index-*") if f.name[6:].isdigit()), default=-1)
             place = folder / f"index-{number:06d}"
             place.mkdir()
-            with tempfile.TemporaryDirectory(dir=folder, prefix=".tmp-") as temporary:
-                blocks = kept.blocks([found[at] for at in range(len(photos.files))], Path(temporary))
-                if protocol.pca:
-                    sample = sample_rows(len(photos.files))
-                    name = f"{', '.join(map(str, sources))}, {len(sample)} of {len(photos.files)} photos"
-                    projection = fit_rows(blocks, sample, protocol.pca, protocol.whiten, name, device)
-                    projection.save(place / PCA)
-                    blocks = projected(blocks, projection)
-                built = build_index(blocks, config.search)
-                save_index(built, place / INDEX)
-                asked = sample_rows(len(photos.files), SAMPLE)
-                taken = np.concatenate([block[np.isin(rows, asked)] for rows, block in blocks()])
-                calibration = calibrate(built, photos, asked, taken, apart)
-                near = {"how": calibration.how, "elsewhere": calibration.elsewhere.tolist()}
-                (place / CALIBRATION).write_text(json.dumps(near) + "\n")
+            blocks = kept.blocks([found[at] for at in range(len(photos.files))])
+            if protocol.pca:
+                sample = sample_rows(len(photos.files))
+                name = f"{', '.join(map(str, sources))}, {len(sample)} of {len(photos.files)} photos"
+                projection = fit_rows(blocks, sample, protocol.pca, protocol.whiten, name, device)
+                projection.save(place / PCA)
+                blocks = projected(blocks, projection)
+            built = build_index(blocks, config.search)
+            save_index(built, place / INDEX)
+            asked = sample_rows(len(photos.files), SAMPLE)
+            taken = np.concatenate([block[np.isin(rows, asked)] for rows, block in blocks()])
+            calibration = calibrate(built, photos, asked, taken, apart)
+            near = {"how": calibration.how, "elsewhere": calibration.elsewhere.tolist()}
+            (place / CALIBRATION).write_text(json.dumps(near) + "\n")
             _write_photos(photos, place / PHOTOS)
             for file in [*place.iterdir(), place]:
                 sync_path(file)
@@ -254,7 +252,7 @@ def _open(folder: Path, fingerprint: str) -> PhotoIndex:
 @contextlib.contextmanager
 def _building(folder: Path) -> Iterator[None]:
     """Holds the folder for one build; refuses a folder that holds other things than an index."""
-    ours = {DESCRIBED, LOCK, "index-*", ".tmp-*"}
+    ours = {DESCRIBED, LOCK, ABOUT + ".tmp", "index-*"}
     if folder.is_dir() and not (folder / ABOUT).is_file() and any(
         not any(entry.match(name) for name in ours) for entry in folder.iterdir()
     ):  # fmt: skip
@@ -325,7 +323,7 @@ def _place(folder: Path, about: dict[str, Any]) -> Path:
 
 def _clean(folder: Path, place: Path) -> None:
     """Removes former indexes, what killed builds left, and the files of the first format."""
-    for left in [*folder.glob("index-*"), *folder.glob(".tmp-*")]:
+    for left in folder.glob("index-*"):
         if left != place:
             shutil.rmtree(left)
     for name in (INDEX, PHOTOS, PCA):

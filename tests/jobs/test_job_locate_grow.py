@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from full_disk import small_files
 from job_process import JobProcess
 from tiny import photo
 from tiny_checkpoint import save_tiny
@@ -203,7 +204,36 @@ def test_killed_at_any_moment_it_is_the_old_index_or_the_new_one(
     finished(start(run, index, "--build", str(photos)))
     finished(start(run, tmp_path / "fresh", "--build", str(photos)))
     assert same_index(index, tmp_path / "fresh") and len(list(index.glob("index-*"))) == 1
-    assert not list(index.glob(".tmp-*"))
+
+
+def test_a_first_build_killed_just_before_its_end_is_continued(
+    model: PlaceModel, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    index = tmp_path / "index"
+
+    class Killed(BaseException):
+        pass
+
+    def kill(self: Path, target: Path) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(Path, "rename", kill)
+        make_index(model, photos, index, CONFIG, "cpu", "f", progress=False)
+    assert (index / "about.json.tmp").exists()
+    make_index(model, photos, index, CONFIG, "cpu", "f", progress=False)
+    assert sorted(f.name for f in index.iterdir()) == [".lock", "about.json", "described", "index-000001"]
+
+
+def test_a_full_disk_leaves_no_half_part(photos: Path, tmp_path: Path) -> None:
+    files = sorted(photos.rglob("*.jpg"))
+    states, described = np.zeros((len(files), 2), np.int64), [(np.arange(len(files)), np.ones((len(files), 50)))]
+    kept = descriptor_cache.KeptDescriptors(tmp_path / "described", {})
+    with pytest.raises(OSError, match="too large"), small_files(1_000):
+        kept.keep(files, states, described)
+    assert list((tmp_path / "described").iterdir()) == []
+    kept.keep(files, states, described)
+    assert len(kept.find(files, states)) == len(files)
 
 
 def test_stale_descriptors_do_not_pile_up(model: PlaceModel, photos: Path, tmp_path: Path) -> None:

@@ -4,8 +4,9 @@
     python -m pytest -s tests/storm/test_kills.py                                a few, in the default tests
 
 Each job (prepare, training on one and two ranks, `evaluate --store`, `locate --build`) runs once undisturbed. The same
-work is then started again and again and killed at a moment drawn from the seed, between its start and a little more
-than the time it took; at last it is left alone, and what it made is compared with the undisturbed run's.
+work is then started again and again and killed at a moment drawn from the seed, between its start and the time it
+took; at last it is left alone, and what it made is compared with the undisturbed run's. Parts and files that only
+large sets have (descriptors in several parts, regions in a file, shared memory of loader workers) are made here, too.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ import os
 import random
 import shutil
 import signal
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +33,12 @@ from safetensors.torch import load_file
 from tiny import make_evaluation, make_gsv, prepare, run_settings
 
 from pipeline.data.plan import plan
+from pipeline.evaluation.describe import encode, sides
+from pipeline.locate import descriptor_cache
 from pipeline.training.records.run_folder import state_of
 from shards.index import read_index
 
+PART = 20_000  # bytes of descriptors in a part, instead of 64 MB
 SOON = 15.0  # seconds in which every process of a killed job is gone
 
 
@@ -120,11 +126,11 @@ def debris(folder: Path) -> list[str]:
     names = (
         "*.tmp",
         "*.part",
-        ".tmp-*",
         ".writing-*",
         ".removing-*",
         ".replaced-*",
         ".status-*",
+        ".*.partial",
         "scratch",
         "regions.*",
     )
@@ -135,13 +141,32 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
 
 
-def storm(root: Path, seed: int, kills: dict[str, int]) -> dict[str, Tally]:
+def temporary_files(folder: Path) -> list[str]:
+    """Files with content in the folder for temporary files, and in shared memory; a killed process cannot remove the
+    empty folders and sockets of Python's `multiprocessing`."""
+    shared = [file for file in Path("/dev/shm").glob("*") if file.name.startswith(("torch_", "sem.mp-"))]
+    return sorted(str(file) for file in [*folder.rglob("*"), *shared] if file.is_file() and file.stat().st_size)
+
+
+def storm(root: Path, seed: int, kills: dict[str, int], patch: pytest.MonkeyPatch) -> dict[str, Tally]:
     """All of it; the table, by kind of work."""
     chance = random.Random(seed)
+    (root / "temporary").mkdir()
+    patch.setattr(tempfile, "tempdir", str(root / "temporary"))  # the forked jobs inherit these
+    patch.setattr(sides, "blocks_of", partial(encode.blocks_of, limit=PART))
+    patch.setattr(encode, "REGIONS_IN_MEMORY", 0)
+    patch.setattr(sides, "IN_MEMORY", 0)
+    patch.setattr(descriptor_cache, "PART_BYTES", PART)
+    patch.setattr(descriptor_cache, "IN_MEMORY", 0)
     prepare(root, places=48)
     kinds = {"prepare": kill_prepare, "training": kill_training, "evaluate --store": kill_evaluate,
              "locate --build": kill_locate}  # fmt: skip
-    found = {name: kill(root, chance, kills[name]) for name, kill in kinds.items() if name in kills}
+    found = {}
+    for name, kill in kinds.items():
+        if name in kills:
+            before = set(temporary_files(root / "temporary"))
+            found[name] = kill(root, chance, kills[name])
+            found[name].left_over += sorted(set(temporary_files(root / "temporary")) - before)
     print(f"\nstorm of kills, seed {seed}")
     for name, tally in found.items():
         print(f"  {name:<18} {tally}")
@@ -224,9 +249,10 @@ def kill_evaluate(root: Path, chance: random.Random, kills: int) -> Tally:
     whole.run(1)
     work = Work("jobs.evaluate", [*words, str(root / "evaluating/out")], root / "evaluating", ranks=(1, 2))
     work.took = whole.took
-    again(work, chance, kills)
+    again(work, chance, kills, lambda: ["--store", chance.choice(["fp32", "fp32", "none"])])
     work.run(2)
     a, b = described(root / "evaluated"), described(root / "evaluating")
+    assert len(list((root / "evaluating/out").rglob("part-*.parquet"))) > 20
     work.tally.lost = sum(key not in b or b[key][0] != values[0] for key, values in a.items())
     work.tally.repeated = sum(len(values) - 1 for values in b.values())
     work.tally.left_over += [key for key in b if key not in a] + debris(root / "evaluating/out")
@@ -246,6 +272,7 @@ def kill_locate(root: Path, chance: random.Random, kills: int) -> Tally:
     work.run(1)
     (a,), (b,) = ([contents(p) for p in (root / f / "out").glob("index-*")] for f in ("located", "locating"))
     work.tally.lost = sum(b.get(name) != data for name, data in a.items())
+    assert len(list((root / "locating/out/described").glob("*.parquet"))) > 10
     rows = [photo for part in (root / "locating/out/described").glob("*.parquet")
             for photo in pq.read_table(part, columns=["photo"])["photo"].to_pylist()]  # fmt: skip
     work.tally.repeated = len(rows) - len(set(rows))
@@ -260,11 +287,12 @@ def judge(found: dict[str, Tally], least: int) -> None:
         assert tally.slowest_end < SOON, f"{name}: {tally}"
 
 
-def test_a_few_kills(tmp_path: Path) -> None:
-    judge(storm(tmp_path, 0, {"prepare": 1, "training": 2}), 2)
+def test_a_few_kills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    judge(storm(tmp_path, 0, {"prepare": 1, "training": 2}, monkeypatch), 2)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_sixty_kills(tmp_path: Path) -> None:
-    judge(storm(tmp_path, 1, {"prepare": 15, "training": 24, "evaluate --store": 15, "locate --build": 12}), 60)
+def test_sixty_kills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kills = {"prepare": 15, "training": 24, "evaluate --store": 15, "locate --build": 12}
+    judge(storm(tmp_path, 1, kills, monkeypatch), 60)

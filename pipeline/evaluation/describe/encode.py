@@ -28,7 +28,7 @@ from torch import Tensor, nn
 
 from pipeline import distributed
 from pipeline.common.errors import told
-from pipeline.common.files import reserve
+from pipeline.common.files import reserve, unnamed_file
 from pipeline.common.progress import Progress
 from pipeline.config import EvaluationConfig
 from pipeline.data import workers
@@ -146,7 +146,7 @@ def encode(
     Args:
         model: has `encode(images [b, 3, S, S]) -> [b, R, D]`, `regions`, `descriptor_dim` and `image_size`.
         wanted: for each grouping, the blocks that will be correlated; a rank keeps what its groups in them need.
-        scratch: folder for the regions of sets too large for memory; None: memory alone.
+        scratch: folder for the regions of sets too large for memory; None: they lie in a file without a name.
         key: digest of what the regions depend on (`Identity`); a file in `scratch` left by a killed run with the same
             key and batch is continued: its progress is counted in batches.
         beyond: photos that will be described next; where one of `paths` is broken, these are looked through too.
@@ -381,11 +381,15 @@ class _Resume:
 
 
 def _allocate(shape: tuple[int, ...], dtype: torch.dtype, scratch: Path | None, key: str) -> tuple[np.ndarray, _Resume]:
-    """Room for regions: memory, or a file for what exceeds `REGIONS_IN_MEMORY`, continued where its key agrees."""
+    """Room for regions: memory, or a file for what exceeds `REGIONS_IN_MEMORY`; one in `scratch` is continued where its
+    key agrees."""
     kind = np.float64 if dtype == torch.float64 else np.float32
     size = int(np.prod(shape)) * np.dtype(kind).itemsize
-    if scratch is None or size <= REGIONS_IN_MEMORY:
+    if size <= REGIONS_IN_MEMORY:
         return np.empty(shape, kind), _Resume(None, key)
+    if scratch is None:
+        with unnamed_file(size) as unnamed:
+            return np.memmap(unnamed, kind, mode="r+", shape=shape), _Resume(None, key)
     scratch.mkdir(parents=True, exist_ok=True)
     file = scratch / f"regions.{distributed.rank()}.bin"
     resume = _Resume(file.with_suffix(".json"), f"{key} {shape} {np.dtype(kind)}")

@@ -7,8 +7,6 @@ un-augmented images of each, and dealt to ranks whole; a last, partial one is fi
 from __future__ import annotations
 
 import dataclasses
-import os
-import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
@@ -18,6 +16,7 @@ import torch
 
 from pipeline import distributed
 from pipeline.common.errors import DataError, UsageError
+from pipeline.common.files import unnamed_file
 from pipeline.common.progress import Progress
 from pipeline.config import DataConfig
 from pipeline.data.images import normalise
@@ -82,11 +81,7 @@ def describe_places(
         if not first:
             return None
         size = total * model.descriptor_dim * 2
-        with tempfile.TemporaryFile(dir=temporary) as file:
-            if hasattr(os, "posix_fallocate"):  # writing into a mapped hole of a full disk kills
-                os.posix_fallocate(file.fileno(), 0, size)
-            else:
-                file.truncate(size)
+        with unnamed_file(size, temporary) as file:
             return np.memmap(file, np.float16, "r+", shape=(total, model.descriptor_dim))
 
     every = distributed.agreed(room, what="making room for descriptors")

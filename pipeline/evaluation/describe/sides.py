@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 import torch
 
 from pipeline import distributed
-from pipeline.common.files import reserve
+from pipeline.common.files import unnamed_file
 from pipeline.config import EvaluationConfig, to_dict
 from pipeline.evaluation.describe.encode import Block, Regions, blocks_of, calls_of, correlate, encode
 from pipeline.evaluation.describe.store import DescriptorStore, StoreWriter, store_folder
@@ -42,8 +41,7 @@ class Engine:
     config: EvaluationConfig
     device: torch.device
     output: Path | None
-    """Folder of the store and of regions too large for memory; None: the temporary one, and no store."""
-    temporary: Path
+    """Folder of the store and of regions too large for memory; None: no store."""
     progress: bool
     fingerprint: str
     """`model_digest`; needed with an output folder."""
@@ -72,7 +70,7 @@ class Engine:
         if self.output is not None:
             files, done = distributed.on_rank_0(open_stores, what=f"the descriptors in {self.output}")
         missing = [p for p in chosen if len(done.get(p, ())) < len(blocks[p])]
-        scratch = (self.output or self.temporary) / "scratch" / f"{evaluated.name}.{side}"
+        scratch = None if self.output is None else self.output / "scratch" / f"{evaluated.name}.{side}"
         regions = None
         if missing:
             regions = encode(
@@ -123,14 +121,14 @@ class DescribedSide:
     done: dict[Protocol, frozenset[int]]
     """Parts that the store held before; the same on all ranks."""
     regions: Regions | None
-    scratch: Path
+    scratch: Path | None
     memory: Memory | None = None
     """Of the bank."""
 
     def describe(self, protocol: Protocol) -> Blocks | None:
         """The descriptors under one protocol, as blocks on rank 0, None elsewhere. Collective."""
         writer = self.writers.get(protocol)
-        held = _Held(self.rows, self.engine.temporary) if writer is None and distributed.rank() == 0 else None
+        held = _Held(self.rows) if writer is None and distributed.rank() == 0 else None
         keep = writer.put if writer is not None else held.put if held is not None else _drop
         if self.regions is not None:
             correlate(
@@ -152,6 +150,8 @@ class DescribedSide:
     def close(self) -> None:
         """Removes the regions' file, which a killed run would have continued. Collective."""
         distributed.barrier()
+        if self.scratch is None:
+            return
         shutil.rmtree(self.scratch, ignore_errors=True)  # all ranks of a machine try; one succeeds
         with contextlib.suppress(OSError):  # the other side's folder is still there
             self.scratch.parent.rmdir()
@@ -160,8 +160,8 @@ class DescribedSide:
 class _Held:
     """One side's descriptors in row order, without a store: in memory, or in a temporary file when large."""
 
-    def __init__(self, rows: int, temporary: Path) -> None:
-        self.rows, self.temporary, self.array = rows, temporary, np.empty((0, 0), np.float32)
+    def __init__(self, rows: int) -> None:
+        self.rows, self.array = rows, np.empty((0, 0), np.float32)
 
     def put(self, number: int, positions: np.ndarray, descriptors: np.ndarray) -> None:
         if len(self.array) == 0:
@@ -169,9 +169,8 @@ class _Held:
             if shape[0] * shape[1] * kind.itemsize <= IN_MEMORY:
                 self.array = np.empty(shape, kind)
             else:
-                file = Path(tempfile.NamedTemporaryFile(dir=self.temporary, delete=False).name)  # noqa: SIM115
-                reserve(file, shape[0] * shape[1] * kind.itemsize)
-                self.array = np.memmap(file, kind, mode="r+", shape=shape)
+                with unnamed_file(shape[0] * shape[1] * kind.itemsize) as file:
+                    self.array = np.memmap(file, kind, mode="r+", shape=shape)
         self.array[positions] = descriptors
 
     def blocks(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -6,10 +6,12 @@ import importlib
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from full_disk import small_files
 
 from pipeline.common.errors import UsageError
-from pipeline.common.files import check_writable
+from pipeline.common.files import check_writable, unnamed_file
 
 
 def unwritable(tmp_path: Path) -> dict[str, Path]:
@@ -51,3 +53,13 @@ def test_jobs_say_so_before_the_work(tmp_path: Path, job: str, monkeypatch: pyte
     with pytest.raises(UsageError, match=r"out: cannot be written \(Not a directory\); give another folder"):
         importlib.import_module(name).main()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.jpg", "file", "model.safetensors"]
+
+
+def test_a_file_without_a_name_lives_as_long_as_its_mapping(tmp_path: Path) -> None:
+    with unnamed_file(4_000, tmp_path) as file:
+        values = np.memmap(file, np.float32, "r+", shape=(1_000,))
+    values[:] = np.arange(1_000)
+    values.flush()
+    assert values.sum() == 499_500 and list(tmp_path.iterdir()) == []
+    with pytest.raises(OSError, match=f"'{tmp_path}'"), small_files(1_000):
+        unnamed_file(4_000, tmp_path)

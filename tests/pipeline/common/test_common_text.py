@@ -119,3 +119,7 @@ def test_a_name_is_shown_as_one_printable_line(name: object, seen: str) -> None:
 def test_every_error_for_the_user_is_one_printable_line() -> None:
     error = DataError("a\nname \x1b[31mred\x1b[0m: broken")
     assert str(error) == r"a\nname \x1b[31mred\x1b[0m: broken" and f"{error}" == str(error)
+    path = "/data/" + "a/" * 450
+    assert str(DataError(f"{path}: missing")) == f"{path}: missing", "an ordinary path stays whole"
+    start, end = str(DataError(f"{'x/' * 5000}: cannot be read")).split("...")
+    assert (start, end) == ("x/" * 250, "/" + "x/" * 249 + ": cannot be read")

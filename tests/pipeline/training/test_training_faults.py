@@ -11,7 +11,6 @@ import errno
 import json
 import multiprocessing
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -25,6 +24,7 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from full_disk import small_files
 from job_process import JobProcess
 from launched import Launched
 from processes import run_ranks
@@ -72,17 +72,6 @@ def broken_copy(root: Path, name: str, part: int) -> tuple[Path, dict[str, Any]]
         file.seek(found["offsets"][2])
         file.write(b"\x00" * 64)
     return root / name, found
-
-
-@contextmanager
-def small_files(limit: int) -> Iterator[None]:
-    """Files of this process cannot grow beyond `limit` bytes: a disk that is full for large files."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def ended(config: RunConfig, fault: Callable[[], Any] | None = None) -> tuple[int, str, float]:

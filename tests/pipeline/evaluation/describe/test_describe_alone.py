@@ -32,7 +32,7 @@ def described(photos: EvaluationSet) -> np.ndarray:
     built, config = model(), EvaluationConfig(groups=("single",), workers=0, batch=5)
     protocol = protocols(config, 28, "pairs")[0]
     with evaluating(built):
-        engine = Engine(built, config, torch.device("cpu"), None, photos.database[0].parent, False, "")
+        engine = Engine(built, config, torch.device("cpu"), None, False, "")
         blocks = engine.side(photos, "database", [protocol]).describe(protocol)
     if blocks is None:  # not rank 0
         return np.zeros(0)

@@ -83,7 +83,7 @@ def described(photos: EvaluationSet, order: list[int], sharded: bool = False, ba
         with evaluating(whole):
             bank = chosen_bank(whole, config, photos.database, device)
             (protocol,) = protocols(config, 28, "pairs", bank)
-            worker = Engine(whole, config, device, None, photos.database[0].parent, False, "")
+            worker = Engine(whole, config, device, None, False, "")
             blocks = worker.side(given, "database", [protocol], bank).describe(protocol)
     if blocks is None:
         return {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,11 @@ def test_a_killed_encoding_continues_from_its_file(tmp_path: Path, monkeypatch: 
         whole = encode(model, paths, [blocks], CONFIG, cpu, progress=False)
         assert not isinstance(whole.values, np.memmap)
         monkeypatch.setattr(encoding, "REGIONS_IN_MEMORY", 0)
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+        (tmp_path / "temporary").mkdir()
+        unnamed = encode(model, paths, [blocks], CONFIG, cpu, progress=False)  # no folder: nothing to continue
+        assert isinstance(unnamed.values, np.memmap) and (unnamed.values == whole.values).all()
+        assert list((tmp_path / "temporary").iterdir()) == [], "a killed process leaves nothing"
         content = paths[280].read_bytes()
         paths[280].write_bytes(b"broken")  # ends the first attempt at batch 70, behind the mark of 64
         with pytest.raises(DataError, match=r"280\.png"):
