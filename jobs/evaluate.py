@@ -32,7 +32,7 @@ class EvaluateJob(EvaluationConfig):
     """Evaluate a checkpoint. Without `sets`, every set found under `root`."""
 
     checkpoint: str = ""
-    """A run folder (its best checkpoint), a checkpoint folder, a .safetensors file, or a released .pth."""
+    """A run folder (its best checkpoint), a checkpoint folder, a .safetensors file, or a released .pth or .pth.tar."""
     output: str | None = None
     """Folder of all results; none: `<run>/evaluation`."""
     track: bool = True

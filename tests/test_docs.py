@@ -21,6 +21,9 @@ import pytest
 import yaml
 from job_process import JobProcess
 from tiny import make_evaluation, make_gsv, photo, run_settings
+from tiny_matchers import netvlad
+
+from pipeline.model.weights.files import save_model
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -55,6 +58,7 @@ SMALL = {
     "jobs.train": "--output launched --tracking.enabled false",
     "jobs.evaluate": "--workers 0 --figures false --track false --group_size 4",
     "jobs.evaluate rerank": "--workers 0 --figures false --track false --rerank_layer 1",
+    "jobs.evaluate by": "--workers 0 --figures false --track false --rerank 4",
     "jobs.evaluate store": "--dimensions 8,4",
     "jobs.compare": "",
     "jobs.locate": "--workers 0",
@@ -110,7 +114,8 @@ class Shown:
         at = words.index("-m")
         kind = words[at + 1] + (f" {words[at + 2]}" if words[at + 1] == "jobs.benchmark" else "")
         for option, what in (("--verify", " verify"), ("--from_store", " store"), ("--pca", " pca"),
-                             ("--rerank", " rerank"), ("--street_places", " streets")):  # fmt: skip
+                             ("--rerank_by", " by"), ("--rerank", " rerank"),
+                             ("--street_places", " streets")):  # fmt: skip
             kind += what if option in words and kind + what in SMALL else ""
         return words + shlex.split(SMALL[kind].format(number=COMMANDS.index(self)))
 
@@ -194,6 +199,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (world / "outputs/cricavpr/checkpoints/best/model.safetensors").resolve(),
         world / "weights" / "resnet50_gem.safetensors",
     )
+    model = netvlad()
+    save_model(model, world / "weights" / "patch_netvlad.safetensors", model.config, model.image_size, everything=True)
     return world
 
 

@@ -31,7 +31,8 @@ from pipeline.evaluation.search.approximate import agreement, build_index, index
 from pipeline.evaluation.search.cores import all_cores
 from pipeline.evaluation.search.exact import Blocks, batches, search, search_within
 from pipeline.evaluation.search.projection import Projection, fit_rows, load_projection, projected, sample_rows
-from pipeline.evaluation.search.rerank import PatchTokens, rerank
+from pipeline.evaluation.search.rerank import build_reranker
+from pipeline.evaluation.search.rerank.second_stage import Described, rerank
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.evaluation.sets.load import load_set
 
@@ -89,7 +90,7 @@ def evaluate(
     results: list[Result] = []
     with _alone_in(output), evaluating(model):
         engine = Engine(model, config, device, output, progress, fingerprint or "")
-        tokens = PatchTokens(model, config, device) if config.rerank else None
+        second = Described(build_reranker(model, config, device)) if config.rerank else None
         bank = None
         for evaluated in sets:
             same(_names_digest(evaluated), f"the digest of the photo names of {evaluated.name}")
@@ -101,8 +102,9 @@ def evaluate(
                 described = {side: sides[side].describe(protocol) for side in SIDES}
                 fitted = (projections or {}).get(protocol.grouping.name)
                 answer = on_rank_0(partial(answer_queries, evaluated, protocol, config, described, fitted))
-                if tokens is not None:
-                    answer = (*rerank(tokens, evaluated, answer[0], answer[1], progress), answer[2])
+                if second is not None:
+                    rows, distances, cost = rerank(second, evaluated, answer[0], answer[1], progress)
+                    answer = (rows, distances, (*answer[2], f"{protocol.name}: {cost}"))
                 results.append(score(evaluated, protocol, config, *answer))
             for side in SIDES:
                 sides[side].close()

@@ -23,6 +23,11 @@ METRIC = re.compile(
     r"(?P<kind>\w+)/(?P<set>.+)\.(?P<protocol>(?:single|shuffled|ordered|bank).*)\.recall_at_(?P<k>\d+)"
 )
 
+SECOND_STAGES = {
+    "patches": "matching patches in space",
+    "patch-netvlad": "Patch-NetVLAD (RANSAC)",
+    "patch-netvlad-rss": "Patch-NetVLAD (rapid spatial scoring)",
+}
 Side = Literal["database", "queries"]
 WORD = 40  # characters of a value in a protocol's name
 
@@ -82,6 +87,8 @@ class Protocol:
     """exact L2, or the approximate index used."""
     rerank: int = named("_rerank{}", "answers", 0)
     """Candidates put in order anew by matching patches in space (a second stage); 0: none, one stage."""
+    rerank_by: str = named("-{}", "answers", "patches")
+    """How they were matched: one of `pipeline.evaluation.search.rerank.RERANKERS`."""
     rerank_layer: int | None = named("l{}", "answers", None)
     """Block or stage of the backbone whose patches were matched; None: its last."""
 
@@ -113,8 +120,8 @@ class Protocol:
                 f"PCA {self.pca}{' whitened' if self.whiten else ''} fitted on {self.pca_source or 'its own database'}"
             )
         missing = "a miss" if self.without_positives == "miss" else "dropped"
-        layer = f" of layer {self.rerank_layer}" if self.rerank_layer else ""
-        second = f", first {self.rerank} re-ranked by matching patches{layer} in space" if self.rerank else ""
+        layer = f", layer {self.rerank_layer}" if self.rerank_layer else ""
+        second = f", first {self.rerank} re-ranked by {SECOND_STAGES[self.rerank_by]}{layer}" if self.rerank else ""
         kept = self.precision if self.stored == self.precision else f"{self.precision}, stored {self.stored}"
         return (
             f"{groups}; {self.image_size} px {interpolation}; {pca}; {kept}; {self.search} L2 search{second}; "
@@ -169,6 +176,7 @@ def protocols(config: EvaluationConfig, image_size: int, rule: str, bank: Bank |
             stored="fp16" if config.store == "fp16" else "fp32",
             search=config.search,
             rerank=config.rerank,
+            rerank_by=config.rerank_by if config.rerank else "patches",
             rerank_layer=config.rerank_layer if config.rerank else None,
             bank_from="train" if groups != "bank" else config.bank_from if bank is None else bank.source,
             bank_digest=bank.digest if groups == "bank" and bank is not None else "",

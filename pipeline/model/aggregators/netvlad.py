@@ -7,6 +7,7 @@ the whole is; the order of the patches does not matter. Parameters are named as 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -33,13 +34,17 @@ class NetVLAD(nn.Module):
             self.projection = nn.Linear(config.clusters * dim, config.projection)
             self.regions, self.dim = 1, config.projection
 
+    def _assigned(self, tokens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """[b, 1 + N, D] -> unit patch features x [b, N, D], their assignment [b, N, K], the centres [K, D]."""
+        x = F.normalize(at_least_float32(tokens[:, 1:]), dim=-1)
+        weight, centres = self.conv.weight.flatten(1).to(x.dtype), self.centroids.to(x.dtype)
+        bias = None if self.conv.bias is None else self.conv.bias.to(x.dtype)
+        return x, F.linear(x, weight, bias).softmax(dim=-1), centres
+
     def forward(self, tokens: Tensor) -> Tensor:
         """[b, 1 + N, D] -> [b, K, D], or [b, 1, D'] with a projection."""
         with torch.autocast(tokens.device.type, enabled=False):
-            x = F.normalize(at_least_float32(tokens[:, 1:]), dim=-1)
-            weight, centres = self.conv.weight.flatten(1).to(x.dtype), self.centroids.to(x.dtype)
-            bias = None if self.conv.bias is None else self.conv.bias.to(x.dtype)
-            assigned = F.linear(x, weight, bias).softmax(dim=-1)  # [b, N, K]
+            x, assigned, centres = self._assigned(tokens)
             # sum of a (x - c) over patches, without the [b, N, K, D] of residuals
             residuals = assigned.transpose(1, 2) @ x - assigned.sum(1).unsqueeze(-1) * centres
             residuals = F.normalize(residuals, dim=-1)
@@ -47,6 +52,31 @@ class NetVLAD(nn.Module):
             return residuals
         projected: Tensor = self.projection(F.normalize(residuals.flatten(1), dim=-1))
         return projected.unsqueeze(1)
+
+    def of_patches(self, tokens: Tensor, grid: tuple[int, int], sizes: Sequence[int]) -> list[Tensor]:
+        """NetVLAD of every square patch of p x p tokens, a token apart (Patch-NetVLAD, section 3.2).
+
+        The sums of a patch are taken over its rows, then over its columns: what an integral image gives, without the
+        rounding of a difference between large sums, which the normalisation of small residuals would magnify.
+
+        Args:
+            tokens: [b, 1 + h*w, D] of a grid of h rows and w columns.
+            sizes: each p, at most h and w.
+
+        Returns:
+            For each size [b, (h-p+1) * (w-p+1), K * D], or D' with a projection, of unit length; row by row.
+        """
+        with torch.autocast(tokens.device.type, enabled=False):
+            x, assigned, centres = self._assigned(tokens)
+            residuals = assigned.transpose(1, 2).unsqueeze(2) * (x.transpose(1, 2).unsqueeze(1) - centres[:, :, None])
+            each = residuals.reshape(len(x), -1, *grid)  # [b, K * D, h, w]
+            found = []
+            for p in sizes:
+                means = F.avg_pool2d(F.avg_pool2d(each, (p, 1), 1), (1, p), 1).flatten(2).transpose(1, 2)
+                sums = F.normalize(means.unflatten(-1, centres.shape), dim=-1).flatten(2)
+                whole = F.normalize(sums, dim=-1)
+                found.append(whole if self.projection is None else F.normalize(self.projection(whole), dim=-1))
+        return found
 
     @torch.no_grad()
     def cluster(self, features: Tensor, seed: int, iterations: int = 50) -> None:

@@ -23,6 +23,7 @@ def load_published(path: str | Path) -> PlaceModel:
 
 
 def load_any(path: str | Path, device: torch.device | str = "cpu") -> PlaceModel:
-    """What `--checkpoint` takes, in eval mode: `load_published` for a .pth, which ours never are, else `load_model`."""
+    """What `--checkpoint` takes, in eval mode: `load_published` for a .pth or .pth.tar, which ours never are, else
+    `load_model`."""
     file = checkpoint_file(path)
-    return load_published(file).to(device) if file.suffix == ".pth" else load_model(file, device)
+    return load_published(file).to(device) if file.suffix in (".pth", ".tar") else load_model(file, device)

@@ -42,7 +42,8 @@ PROTOCOL = Protocol(groups="ordered", group_size=16)
 OTHER: dict[str, Any] = {
     "groups": "shuffled", "group_size": 8, "group_seed": 1, "pca": 64, "whiten": True, "pca_source": "pitts30k",
     "resize": "published", "image_size": 322, "rule": "10 m", "without_positives": "drop", "precision": "bf16",
-    "stored": "fp16", "search": "hnsw", "rerank": 5, "rerank_layer": 2, "bank_from": "map",
+    "stored": "fp16", "search": "hnsw", "rerank": 5, "rerank_by": "patch-netvlad",
+    "rerank_layer": 2, "bank_from": "map",
 }  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,9 @@ from pipeline.config import EvaluationConfig, ModelConfig, RunConfig
 from pipeline.config.baselines import ResNetConfig
 from pipeline.config.model import AdapterConfig, BackboneConfig, CrossImageConfig
 from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.search.rerank import PatchTokens, inliers, mutual_matches, rerank
+from pipeline.evaluation.search.rerank import build_reranker
+from pipeline.evaluation.search.rerank.matches import mutual_matches, similarity_inliers
+from pipeline.evaluation.search.rerank.second_stage import Described, rerank
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.training.validation import Validation
@@ -40,10 +43,10 @@ def test_inliers_are_the_matches_of_one_transform(scale: float, turn: float, kep
     left = left % 20 + 1j * (left // 20)
     right = scale * np.exp(1j * turn) * left + (2 - 3j)
     right[30:] = rng.uniform(0, 20, 20) + 1j * rng.uniform(0, 20, 20)
-    found = inliers(left, right, (3, 4))
-    assert found == inliers(left, right, (3, 4))
+    found = similarity_inliers(left, right, (3, 4))
+    assert found == similarity_inliers(left, right, (3, 4))
     assert kept <= found <= kept + 6 if kept else found < 12
-    assert [inliers(left[:n], right[:n]) for n in (0, 1)] == [0, 1]
+    assert [similarity_inliers(left[:n], right[:n]) for n in (0, 1)] == [0, 1]
 
 
 class Colours(torch.nn.Module):
@@ -110,26 +113,31 @@ def test_too_coarse_a_grid_is_refused(scrambled: EvaluationSet) -> None:
         evaluate(model, [scrambled], EvaluationConfig(groups=("single",), workers=0, rerank=2), "cpu", progress=False)
 
 
-def reranked(evaluated: EvaluationSet) -> tuple[np.ndarray, np.ndarray] | str:
+def reranked(evaluated: EvaluationSet) -> tuple[np.ndarray, np.ndarray, str] | str:
     config = EvaluationConfig(groups=("single",), recalls=(1, 2), workers=0, rerank=4)
     try:
         (result,) = evaluate(Colours(), [evaluated], config, "cpu", progress=False)
     except DataError as error:
         return str(error)
-    return result.predictions, result.distances
+    return result.predictions, result.distances, result.remarks[-1]
 
 
 def test_the_queries_are_shared_by_the_processes(scrambled: EvaluationSet) -> None:
     """Three processes share four queries and all get the answer of one."""
     truth = reranked(scrambled)
-    for rank in run_ranks(reranked, 3, scrambled):
-        assert all((found == wanted).all() for found, wanted in zip(rank, truth, strict=True))
+    ranks = run_ranks(reranked, 3, scrambled)
+    for rank in ranks:
+        assert all((found == wanted).all() for found, wanted in zip(rank[:2], truth[:2], strict=True))
+    # time and memory are told, for all processes together: 64 patches x 3 numbers x 2 bytes, of 1 + 4 photos
+    assert len({rank[2] for rank in ranks}) == 1
+    assert re.match(r"single\S+: re-ranking takes 0\.\d+ s a query .* 0\.0 MB for it .* \(0\.00 MB", truth[2])
 
 
 def broken_after_the_search(evaluated: EvaluationSet) -> str:
     rows = np.tile(np.arange(8), (4, 1))
     try:
-        rerank(PatchTokens(Colours(), EvaluationConfig(rerank=4), "cpu"), evaluated, rows, rows.astype(np.float32))
+        stage = Described(build_reranker(Colours(), EvaluationConfig(rerank=4), "cpu"))
+        rerank(stage, evaluated, rows, rows.astype(np.float32))
     except DataError as error:
         return str(error)
     return ""
@@ -178,7 +186,7 @@ def test_a_layer_is_part_of_the_protocol_and_one_that_is_not_there_is_refused(sc
     model = tiny_model("transformer")
     asked = EvaluationConfig(groups=("single",), recalls=(1,), workers=0, rerank=2, rerank_layer=1)
     (result,) = evaluate(model, [scrambled], asked, "cpu", progress=False)
-    assert result.protocol.name == "single_28px_pairs_rerank2l1" and "patches of layer 1" in result.protocol.describe()
+    assert result.protocol.name == "single_28px_pairs_rerank2l1" and "in space, layer 1" in result.protocol.describe()
     with pytest.raises(UsageError, match="layer 9"):
         evaluate(model, [scrambled], dataclasses.replace(asked, rerank_layer=9), "cpu", progress=False)
 
