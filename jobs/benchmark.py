@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from jobs.cli import parse_part, run_job
 from pipeline.common.errors import UsageError
-from pipeline.config import RunConfig, TrainConfig
+from pipeline.config import RunConfig, SearchKind, TrainConfig
 
 if TYPE_CHECKING:
     import torch
@@ -135,8 +135,10 @@ class Search:
     """Queries; with --store all stored queries."""
     recalls: tuple[int, ...] = (1, 10)
     """Nearest neighbours N: the result is the percentage of the exact N that were also found."""
-    kinds: tuple[Literal["exact", "hnsw", "ivfpq"], ...] = ("exact", "hnsw", "ivfpq")
+    kinds: tuple[SearchKind, ...] = ("exact", "int8", "binary", "hnsw", "ivfpq")
     """Kinds of search to measure."""
+    refine: int = 0
+    """int8, binary, ivfpq: candidates that float descriptors order anew; 0: none."""
     store: str | None = None
     """A folder of stored descriptors (it holds database/ and queries/) instead of made ones."""
     pca: int | None = None
@@ -288,7 +290,7 @@ def search(job: Search) -> None:
         lines = search.projections(job.rows, job.dim, job.pca, job.sklearn, job.timeout, job.seed)
     else:
         lines = search.searches(
-            job.store, job.rows, job.dim, job.queries, job.kinds, job.recalls, job.timeout, job.seed
+            job.store, job.rows, job.dim, job.queries, job.kinds, job.refine, job.recalls, job.timeout, job.seed
         )
     for line in lines:
         print(line, flush=True)

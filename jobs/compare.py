@@ -5,7 +5,8 @@
 
 Runs that jobs.evaluate has evaluated are compared query by query with the first of them, or each with each: the
 difference in recall with its 95 % interval (paired bootstrap), called real only where McNemar's exact test agrees.
---evaluations compares folders of evaluations (also of stored descriptors or of a released model) without MLflow.
+--evaluations compares folders of evaluations (also of a released model) without MLflow. What an evaluation scored from
+its stored descriptors (PCA, prefixes, codes) is compared as well, each under its own protocol.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ def main() -> None:
     (folder / "comparison.csv").write_text(table.csv())
     written = [folder / "comparison.md", folder / "comparison.csv"]
     names = list(dict.fromkeys(run.name for run in runs))
-    folders = [(name, Path(job.output) / name / "evaluation/predictions") for name in names]
+    folders = [(name, Path(job.output) / name / "evaluation") for name in names]
     found, left_out = significance.compare_folders(folders, every_pair=job.pairs == "all")
     if len(names) > 1:
         print(
@@ -87,7 +88,7 @@ def compare_evaluations(job: CompareJob) -> None:
         raise UsageError("give --runs or --evaluations, not both")
     if len(set(job.evaluations)) < 2:
         raise UsageError("--evaluations needs at least two different folders, one,another")
-    folders = [(name, Path(name) / "predictions") for name in dict.fromkeys(job.evaluations)]
+    folders = [(name, Path(name)) for name in dict.fromkeys(job.evaluations)]
     found, left_out = significance.compare_folders(folders, every_pair=job.pairs == "all")
     for note in left_out:
         print(f"not compared: {note}", file=sys.stderr)

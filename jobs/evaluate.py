@@ -2,13 +2,14 @@
 
     python -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k,msls_val --root data
     accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k
-    python -m jobs.evaluate --from_store outputs/RUN/evaluation --dimensions 4096,1024,256
+    python -m jobs.evaluate --from_store outputs/RUN/evaluation --dimensions 512 --searches int8,binary --refine 100
 
 Prints one table and writes results.json, results.md, results.csv, predictions/, figures/ and report.html. The number of
 processes changes nothing but the time. Sets that are missing are named and left out; exit code 3 when none is there.
 
 --from_store needs no model and no GPU, and opens no photo: every grouping that an evaluation with --store wrote is
-scored again, with all dimensions and with each of --dimensions. The sets must still be in their folders.
+scored again: whole, and made small by each of --dimensions (PCA), --prefixes and --searches, with bytes an image, time
+a query, and the difference to the whole descriptors. The sets must still be in their folders.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from jobs.cli import parse, run_job
 from jobs.there import need_model, need_sets
 from pipeline.common.errors import UsageError
 from pipeline.common.files import check_writable
-from pipeline.config import EvaluationConfig, to_dict
+from pipeline.config import EvaluationConfig, SearchKind, to_dict
 
 
 @dataclass(frozen=True)
@@ -47,10 +48,14 @@ class EvaluateJob(EvaluationConfig):
     """Score stored descriptors instead of a checkpoint: the folder that an evaluation with --store wrote to."""
     dimensions: tuple[int, ...] = ()
     """from_store: PCA dimensions, a row for each; PCA is fitted on each set's own database."""
+    prefixes: tuple[int, ...] = ()
+    """from_store: numbers of first dimensions, a row for each."""
+    searches: tuple[SearchKind, ...] = ()
+    """from_store: kinds of search beside --search, a row for each; those of codes with --refine two."""
 
 
 # what a store's descriptors leave open; all other settings of an evaluation were decided when they were made
-OPEN = ("sets", "root", "split", "recalls", "radius", "frames", "without_positives", "pca_whiten", "search")
+OPEN = ("sets", "root", "split", "recalls", "radius", "frames", "without_positives", "pca_whiten", "search", "refine")
 
 
 def main() -> None:
@@ -60,8 +65,9 @@ def main() -> None:
     if job.from_store is not None:
         stored(job, Path(job.from_store), config)
         return
-    if job.dimensions:
-        raise UsageError("--dimensions goes with --from_store; with a checkpoint give --pca")
+    for name, instead in (("dimensions", "pca"), ("prefixes", "prefix"), ("searches", "search")):
+        if getattr(job, name):
+            raise UsageError(f"--{name} goes with --from_store; with a checkpoint give --{instead}")
     if not job.checkpoint:
         raise UsageError("--checkpoint is missing: a run folder such as outputs/cricavpr, or a model file")
     need_model(job.checkpoint)
@@ -127,8 +133,8 @@ def stored(job: EvaluateJob, folder: Path, config: EvaluationConfig) -> None:
     for field in dataclasses.fields(EvaluationConfig):
         if field.name not in OPEN and getattr(config, field.name) != field.default:
             raise UsageError(f"--{field.name}: stored descriptors have their own; leave it out, or evaluate again")
-    if any(number < 1 for number in (*job.dimensions, *job.recalls)):
-        raise UsageError("--dimensions and --recalls start at 1")
+    if any(number < 1 for number in (*job.dimensions, *job.prefixes, *job.recalls)):
+        raise UsageError("--dimensions, --prefixes and --recalls start at 1")
     from pipeline.evaluation.describe.stored import evaluate_stores, stored_sets
     from pipeline.evaluation.predictions import save_results
     from pipeline.evaluation.report import tables
@@ -139,7 +145,7 @@ def stored(job: EvaluateJob, folder: Path, config: EvaluationConfig) -> None:
     sets, left_out = load_sets(config.sets or stored_sets(folder), config)
     for line in left_out:
         print(f"left out: {line}", file=sys.stderr)
-    results = evaluate_stores(folder, sets, config, (None, *job.dimensions))
+    results = evaluate_stores(folder, sets, config, job.dimensions, job.prefixes, job.searches)
     tables.show(results)
     save_results(results, sets, output, {"stores": str(folder), "evaluation": to_dict(config), "left_out": left_out})
     print(f"\nwritten to {output}/")

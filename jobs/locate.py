@@ -24,6 +24,7 @@ from jobs.cli import parse, run_job
 from jobs.there import need_model
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import check_writable
+from pipeline.config import SearchKind
 
 if TYPE_CHECKING:
     from pipeline.locate.answers import Answer, Locator
@@ -63,8 +64,14 @@ class LocateJob:
     apart_frames: int | None = None
     """Building, where no position is known: photos of one folder with more than so many between them are of different
     places; none: not known, and no confidence is told."""
-    search: Literal["exact", "ivfpq", "hnsw"] = "exact"
-    """Building: exact search, or an approximate one for very many photos."""
+    search: SearchKind = "exact"
+    """Building: exact search, of codes of a byte (int8) or a bit (binary) a dimension, or approximate for very many
+    photos."""
+    refine: int = 0
+    """Building: int8, binary, ivfpq: float descriptors, read from the disk, put so many first candidates in order
+    anew; 0: none."""
+    prefix: int | None = None
+    """Building: dimensions kept from the beginning of the descriptor (of a model trained with loss.prefixes)."""
     pca: int | None = None
     """Building: dimensions kept by PCA of the index's own photos; none keeps all."""
     resize: Literal["antialias", "published"] = "antialias"
@@ -169,6 +176,7 @@ def run(job: LocateJob) -> None:
         batch = job.batch or (1 if torch.device(device).type == "cpu" else 32)
         groups = job.groups if job.groups != "auto" else "single" if model.bank is None else "bank"
         config = EvaluationConfig(groups=(groups,), resize=job.resize, precision=job.precision, search=job.search,
+                                  refine=job.refine, prefix=job.prefix,
                                   pca=job.pca, batch=batch, workers=job.workers)  # fmt: skip
         sources, about = [Path(source) for source in job.build], {"checkpoint": str(file)}
         apart = Apart(job.apart, job.apart_frames)

@@ -21,7 +21,7 @@ BLOCK = 2_048  # rows made or read at a time
 
 
 def searches(
-    store: str | None, rows: int, dim: int, queries: int, kinds: Sequence[str], recalls: Sequence[int],
+    store: str | None, rows: int, dim: int, queries: int, kinds: Sequence[str], refine: int, recalls: Sequence[int],
     timeout: float, seed: int,
 ) -> Iterator[str]:  # fmt: skip
     """A line for each kind of search.
@@ -30,6 +30,7 @@ def searches(
         store: folder of stored descriptors (it holds database/ and queries/); none: made ones, [rows, dim].
         rows, dim, queries: sizes of made descriptors.
         kinds: `exact` and faiss's approximations.
+        refine: candidates of the kinds of codes that float descriptors order anew.
         recalls: the n of "percent of the n exact neighbours that were found".
         timeout: seconds after which one measurement is given up, and said so.
         seed: of made descriptors.
@@ -38,7 +39,7 @@ def searches(
         database, asked, counts, dim = descriptors(store, rows, dim, queries, seed, Path(scratch))
         yield f"{counts[1]:,} queries in {counts[0]:,} x {dim} descriptors, threads: {_threads()}"
         for kind in kinds:
-            yield f"{kind:<8}{_line(alone(_search, timeout, kind, database, asked, dim, tuple(recalls)))}"
+            yield f"{kind:<8}{_line(alone(_search, timeout, kind, refine, database, asked, dim, tuple(recalls)))}"
 
 
 def projections(rows: int, dim: int, dims: int, beside_sklearn: bool, timeout: float, seed: int) -> Iterator[str]:
@@ -106,7 +107,7 @@ def _line(got: Measured) -> str:
     return got.problem or f"{got.answer}  peak {got.peak / 1e9:.2f} GB"
 
 
-def _search(kind: str, database: str, queries: str, dim: int, ks: tuple[int, ...]) -> str:
+def _search(kind: str, refine: int, database: str, queries: str, dim: int, ks: tuple[int, ...]) -> str:
     from pipeline.evaluation.search.approximate import agreement, build_index, index_bytes, search_index
     from pipeline.evaluation.search.exact import search, slices
 
@@ -114,10 +115,10 @@ def _search(kind: str, database: str, queries: str, dim: int, ks: tuple[int, ...
     asked = np.fromfile(queries, np.float32).reshape(-1, dim)
     k = max(ks)
     start = time.perf_counter()
-    index = build_index(lambda: slices(rows), kind)
+    index = build_index(lambda: slices(rows), kind, refine > 0)
     built = time.perf_counter() - start
     start = time.perf_counter()
-    found = search_index(index, asked, k)[1]
+    found = search_index(index, asked, k, refine)[1]
     seconds = time.perf_counter() - start
     exact = found if kind == "exact" else search(asked, slices(rows), k)[1]
     kept = "  ".join(f"{n} of {n}: {agreement(found[:, :n], exact[:, :n]):5.1f} %" for n in ks)

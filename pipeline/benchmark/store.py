@@ -146,7 +146,7 @@ def recalls(output: Path, dims: int, k: int) -> tuple[float, list[float]]:
     evaluated = EvaluationSet(NAME, files[0], files[1], positives, "pairs")  # type: ignore[arg-type]
     config = dataclasses.replace(EvaluationConfig(), recalls=(1, k), groups=("single",))
     start = time.perf_counter()
-    results = evaluate_stores(output, [evaluated], config, (None, dims))
+    results = evaluate_stores(output, [evaluated], config, (dims,))
     return time.perf_counter() - start, [result.recalls[1] for result in results]
 
 

@@ -36,6 +36,7 @@ from pipeline.config.setting import (
 MANY = 1024  # processes, or batches ahead, that no machine needs
 SEEDS = 2**31 - 1  # the largest seed: a step's own seed has it in its upper half
 MONTH = 2_592_000  # seconds
+SearchKind = Literal["exact", "int8", "binary", "ivfpq", "hnsw"]
 UNLESS_COSINE: OnResume = "free unless train.schedule=cosine"  # whose rate follows the length of the run
 
 
@@ -100,6 +101,9 @@ class LossConfig(Settings):
     """Mining margin (paper: 0.1)."""
     ignore_within: float = setting(0.0, changes="numbers", at_least=0)
     """Pairs of different places closer than this many metres are neither positive nor negative; 0: none (published)."""
+    prefixes: tuple[int, ...] = setting((), changes="numbers", at_least=1, may_be_empty=True)
+    """Also the loss of the first so many dimensions of each descriptor, of unit length again, added for each number
+    (Matryoshka, Kusupati et al. 2022): descriptors can then be cut there; empty: none (published)."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,9 @@ class EvaluationConfig(Settings):
     """antialias: resize as in training, then normalise; published: normalise, then resize without antialias."""
     pca: int | None = setting(None, changes="numbers", at_least=1)
     """Dimensions kept by PCA; none keeps all (paper: 4096)."""
+    prefix: int | None = setting(None, changes="numbers", at_least=1)
+    """Dimensions kept from the beginning of the descriptor (of a model trained with `loss.prefixes`), not with pca;
+    none keeps all."""
     batch: int = setting(32, changes="speed", at_least=1, at_most=65_536)
     """Images per forward pass of the per-image part; changes memory, not the result."""
     workers: int = setting(4, changes="speed", at_least=0, at_most=MANY)
@@ -149,8 +156,11 @@ class EvaluationConfig(Settings):
     """PCA is fitted on this set's database, at most 16,384 images (paper: Pitts30k train); none: each set's own."""
     pca_whiten: bool = setting(False, changes="numbers")
     """Scale the PCA dimensions to unit variance (published: no)."""
-    search: Literal["exact", "ivfpq", "hnsw"] = setting("exact", changes="numbers")
-    """Exact L2 search, or a faiss approximation for large sets, whose recall against exact is measured and printed."""
+    search: SearchKind = setting("exact", changes="numbers")
+    """Exact L2 search, or one by faiss whose recall against exact is measured and printed: of codes of a byte (int8) or
+    a bit (binary) a dimension, or for large sets (ivfpq, hnsw)."""
+    refine: int = setting(0, changes="numbers", at_least=0, at_most=10_000)
+    """int8, binary, ivfpq: float descriptors put so many first candidates in order anew; 0: none."""
     rerank: int = setting(0, changes="numbers", at_least=0, at_most=10_000)
     """Re-rank this many first candidates by matching patches in space; 0: none. Reads their images again; not for
     validation during training."""

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,13 +25,22 @@ from pipeline.distributed import held_on_rank_0, on_rank_0, same
 from pipeline.evaluation.describe.bank import chosen_bank
 from pipeline.evaluation.describe.encode import evaluating
 from pipeline.evaluation.describe.sides import Engine
+from pipeline.evaluation.difference import Difference
 from pipeline.evaluation.identity import Identity, files_digest, model_digest
 from pipeline.evaluation.protocol import Protocol, Side, protocols
 from pipeline.evaluation.recall import recall_at
-from pipeline.evaluation.search.approximate import agreement, build_index, index_bytes, search_index
+from pipeline.evaluation.search.approximate import agreement, build_index, bytes_each, index_bytes, search_index
 from pipeline.evaluation.search.cores import all_cores
 from pipeline.evaluation.search.exact import Blocks, batches, search, search_within
-from pipeline.evaluation.search.projection import Projection, fit_rows, load_projection, projected, sample_rows
+from pipeline.evaluation.search.projection import (
+    Prefix,
+    Projection,
+    check_prefix,
+    fit_rows,
+    load_projection,
+    projected,
+    sample_rows,
+)
 from pipeline.evaluation.search.rerank import build_reranker
 from pipeline.evaluation.search.rerank.second_stage import Described, rerank
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
@@ -58,6 +68,35 @@ class Result:
     """Squared L2 of the predictions, float32 [Q, max N]."""
     remarks: tuple[str, ...] = ()
     """What a reader should know, for example how well an approximate search agrees with the exact one."""
+    cost: SearchCost | None = None
+    """Where it was asked for: of stored descriptors."""
+    against: Difference | None = None
+    """Where there is one: to the exact search in the full descriptors, at the smallest N."""
+
+
+@dataclass(frozen=True)
+class SearchCost:
+    """What a search keeps and takes."""
+
+    bytes_each: int
+    """Of a database image, in what the search reads whole: codes, or float32 descriptors."""
+    refine_bytes: int
+    """Of a database image, in the floats that order the candidates anew; 0 without that."""
+    milliseconds: float
+    """A query, all queries being asked at once, on the threads there are; reading and projecting descriptors left
+    out."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What a search found for Q queries."""
+
+    rows: np.ndarray
+    """Database rows int64 [Q, k], best first; -1 where there are fewer."""
+    distances: np.ndarray
+    """Squared L2, float32 [Q, k]."""
+    remarks: tuple[str, ...] = ()
+    cost: SearchCost | None = None
 
 
 def evaluate(
@@ -90,6 +129,7 @@ def evaluate(
     results: list[Result] = []
     with _alone_in(output), evaluating(model):
         engine = Engine(model, config, device, output, progress, fingerprint or "")
+        check_prefix(config.prefix, int(engine.model.descriptor_dim))
         second = Described(build_reranker(model, config, device)) if config.rerank else None
         bank = None
         for evaluated in sets:
@@ -103,9 +143,10 @@ def evaluate(
                 fitted = (projections or {}).get(protocol.grouping.name)
                 answer = on_rank_0(partial(answer_queries, evaluated, protocol, config, described, fitted))
                 if second is not None:
-                    rows, distances, cost = rerank(second, evaluated, answer[0], answer[1], progress)
-                    answer = (rows, distances, (*answer[2], f"{protocol.name}: {cost}"))
-                results.append(score(evaluated, protocol, config, *answer))
+                    rows, distances, cost = rerank(second, evaluated, answer.rows, answer.distances, progress)
+                    remarks = (*answer.remarks, f"{protocol.name}: {cost}")
+                    answer = dataclasses.replace(answer, rows=rows, distances=distances, remarks=remarks)
+                results.append(score(evaluated, protocol, config, answer))
             for side in SIDES:
                 sides[side].close()
     return results
@@ -210,57 +251,93 @@ def answer_queries(
     config: EvaluationConfig,
     described: Mapping[Side, Blocks | None],
     fitted: Projection | None = None,
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+) -> Answers:
     """The search itself, on one process, from descriptors in memory or in a store.
 
-    Returns (database rows [Q, k], squared distances [Q, k], remarks). PCA is fitted on the set's own database where
-    the protocol asks for PCA and none is given.
+    PCA is fitted on the set's own database where the protocol asks for PCA and none is given.
     """
     database, queries = _there(described["database"]), _there(described["queries"])
     if protocol.pca:
-        rows = sample_rows(len(evaluated.database))
-        about = f"{evaluated.name} database, {len(rows)} of {len(evaluated.database)} images, {protocol.grouping.name}"
-        fitted = fitted or fit_rows(database, rows, protocol.pca, protocol.whiten, about)
-        database, queries = projected(database, fitted), projected(queries, fitted)
+        short: Projection | Prefix = fitted or own_projection(evaluated, protocol, database)
+    elif protocol.prefix:
+        short = Prefix(protocol.prefix)
+    if protocol.pca or protocol.prefix:
+        database, queries = projected(database, short), projected(queries, short)
     k = max(*config.recalls, protocol.rerank)
     found = np.full((len(evaluated.queries), k), -1, np.int64)
     distances = np.full((len(evaluated.queries), k), np.inf, np.float32)
     parts = evaluated.database_part, evaluated.query_part
-    if parts[0] is not None and parts[1] is not None:
+    clock, within = Clock(), parts[0] is not None and parts[1] is not None
+    if within or protocol.search == "exact":
+        dim = 0
         for numbers, asked in batches(queries):
-            distances[numbers], found[numbers] = search_within(asked, parts[1][numbers], database, parts[0], k)
-        return found, distances, ("each query is searched within its own part of the database",)
-    if protocol.search == "exact":
-        for numbers, asked in batches(queries):
-            distances[numbers], found[numbers] = search(asked, database(), k)
-        return found, distances, ()
-    index = build_index(database, protocol.search)
+            dim = asked.shape[1]
+            with clock:
+                if parts[0] is not None and parts[1] is not None:
+                    answers = search_within(asked, parts[1][numbers], clock.outside(database), parts[0], k)
+                else:
+                    answers = search(asked, clock.outside(database)(), k)
+            distances[numbers], found[numbers] = answers
+        remarks = ("each query is searched within its own part of the database",) * within
+        return Answers(found, distances, remarks, SearchCost(4 * dim, 0, 1e3 * clock.seconds / len(found)))
+    index = build_index(database, protocol.search, protocol.refine > 0)
     sample = sample_rows(len(evaluated.queries), 1_000)  # the exact answer of some tells what the approximation costs
     exact: list[np.ndarray] = []
     near: list[np.ndarray] = []
     for numbers, asked in batches(queries):
-        distances[numbers], found[numbers] = search_index(index, asked, k)
+        with clock:
+            distances[numbers], found[numbers] = search_index(index, asked, k, protocol.refine)
         if (inside := np.isin(numbers, sample)).any():
             exact.append(search(asked[inside], database(), k)[1])
             near.append(found[numbers[inside]])
     agreed = agreement(np.concatenate(near), np.concatenate(exact))
-    remark = f"{protocol.search} finds {agreed:.1f} % of the exact {k} neighbours ({len(sample):,} queries), index"
-    return found, distances, (f"{remark} {index_bytes(index) / 1e6:,.1f} MB",)
+    what = protocol.search + (f", refined among {protocol.refine}," if protocol.refine else "")
+    remark = f"{what} finds {agreed:.1f} % of the exact {k} neighbours ({len(sample):,} queries), index"
+    cost = SearchCost(*bytes_each(index), 1e3 * clock.seconds / len(found))
+    return Answers(found, distances, (f"{remark} {index_bytes(index) / 1e6:,.1f} MB",), cost)
 
 
-def score(
-    evaluated: EvaluationSet,
-    protocol: Protocol,
-    config: EvaluationConfig,
-    predictions: np.ndarray,
-    distances: np.ndarray,
-    remarks: tuple[str, ...] = (),
-) -> Result:
+def own_projection(evaluated: EvaluationSet, protocol: Protocol, database: Blocks) -> Projection:
+    """The PCA that the protocol asks for, of the set's own database."""
+    rows = sample_rows(len(evaluated.database))
+    about = f"{evaluated.name} database, {len(rows)} of {len(evaluated.database)} images, {protocol.grouping.name}"
+    return fit_rows(database, rows, protocol.pca or 0, protocol.whiten, about)
+
+
+class Clock:
+    """Seconds inside `with clock`, without those in which blocks come that are read `outside` of it."""
+
+    def __init__(self) -> None:
+        self.seconds, self._start = 0.0, 0.0
+
+    def __enter__(self) -> None:
+        self._start = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds += time.perf_counter() - self._start
+
+    def outside(self, blocks: Blocks) -> Blocks:
+        """The same blocks, with the clock stopped while each is made."""
+
+        def paused() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+            coming = iter(blocks())
+            while True:
+                start = time.perf_counter()
+                block = next(coming, None)
+                self.seconds -= time.perf_counter() - start
+                if block is None:
+                    return
+                yield block
+
+        return paused
+
+
+def score(evaluated: EvaluationSet, protocol: Protocol, config: EvaluationConfig, answers: Answers) -> Result:
     """Predictions [Q, k] -> the result, without recalls where the set has no ground truth."""
     recalls: dict[int, float] = {}
     if evaluated.has_ground_truth:
         recalls = recall_at(
-            predictions, evaluated.positives, config.recalls, without_positives=config.without_positives
+            answers.rows, evaluated.positives, config.recalls, without_positives=config.without_positives
         )
     return Result(
         evaluated.name,
@@ -269,9 +346,9 @@ def score(
         len(evaluated.queries),
         len(evaluated.database),
         sum(len(positives) == 0 for positives in evaluated.positives),
-        predictions,
-        distances,
-        tuple(evaluated.remarks) + remarks,
+        answers.rows,
+        answers.distances,
+        tuple(evaluated.remarks) + answers.remarks,
     )
 
 

@@ -15,8 +15,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipeline.common.errors import DataError
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
+from pipeline.evaluation.search.approximate import CODES
 from pipeline.model.bank import Bank
 
 METRIC = re.compile(
@@ -71,6 +72,8 @@ class Protocol:
     """Whether PCA also scales each direction to unit variance."""
     pca_source: str | None = named("_from-{}", "answers", None)
     """Whose database descriptors PCA was fitted on; None: the evaluated set's own."""
+    prefix: int | None = named("_prefix{}", "answers", None)
+    """Dimensions kept from the beginning of the descriptor, of unit length again; None keeps all."""
     resize: str = named("_{}", "descriptors", "antialias")
     """antialias, or published: normalised first, then bilinear without antialias."""
     image_size: int = named("_{}px", "descriptors", 224)
@@ -85,6 +88,8 @@ class Protocol:
     """Type in which descriptors were kept before the search: fp32 or fp16."""
     search: str = named("_{}", "answers", "exact")
     """exact L2, or the approximate index used."""
+    refine: int = named("_refine{}", "answers", 0)
+    """Candidates of an index of codes that float descriptors put in order anew; 0: none."""
     rerank: int = named("_rerank{}", "answers", 0)
     """Candidates put in order anew by matching patches in space (a second stage); 0: none, one stage."""
     rerank_by: str = named("-{}", "answers", "patches")
@@ -119,12 +124,15 @@ class Protocol:
             pca = (
                 f"PCA {self.pca}{' whitened' if self.whiten else ''} fitted on {self.pca_source or 'its own database'}"
             )
+        elif self.prefix:
+            pca = f"the first {self.prefix} dimensions"
         missing = "a miss" if self.without_positives == "miss" else "dropped"
         layer = f", layer {self.rerank_layer}" if self.rerank_layer else ""
         second = f", first {self.rerank} re-ranked by {SECOND_STAGES[self.rerank_by]}{layer}" if self.rerank else ""
+        floats = f", first {self.refine} ordered anew by float descriptors" if self.refine else ""
         kept = self.precision if self.stored == self.precision else f"{self.precision}, stored {self.stored}"
         return (
-            f"{groups}; {self.image_size} px {interpolation}; {pca}; {kept}; {self.search} L2 search{second}; "
+            f"{groups}; {self.image_size} px {interpolation}; {pca}; {kept}; {self.search} L2 search{floats}{second}; "
             f"positives {self.rule}; queries without positives {missing}"
         )
 
@@ -157,8 +165,26 @@ def read_protocol(values: Any, where: str) -> Protocol:
         raise DataError(f"{where}: not a protocol of this version; evaluate again") from None
 
 
+def candidates(kind: str, config: EvaluationConfig) -> int:
+    """The candidates that floats order anew in a search of this kind: 0 for one that has no codes.
+
+    Raises:
+        UsageError: fewer than are asked for.
+    """
+    wanted = max(*config.recalls, config.rerank)
+    if kind in CODES and 0 < config.refine < wanted:
+        raise UsageError(f"refine {config.refine} orders fewer candidates than are asked for ({wanted}); raise it")
+    return config.refine if kind in CODES else 0
+
+
 def protocols(config: EvaluationConfig, image_size: int, rule: str, bank: Bank | None = None) -> list[Protocol]:
-    """The protocols that the configuration asks for, in its order; `bank`: the one that `groups` bank is beside."""
+    """The protocols that the configuration asks for, in its order; `bank`: the one that `groups` bank is beside.
+
+    Raises:
+        UsageError: settings that do not go together.
+    """
+    if config.pca and config.prefix:
+        raise UsageError("give pca or prefix, not both")
     sizes = {"single": 1, "bank": config.bank if bank is None else len(bank.regions)}
     return [
         Protocol(
@@ -168,6 +194,7 @@ def protocols(config: EvaluationConfig, image_size: int, rule: str, bank: Bank |
             image_size=image_size,
             resize=config.resize,
             pca=config.pca,
+            prefix=config.prefix,
             rule=rule,
             without_positives=config.without_positives,
             whiten=config.pca_whiten and config.pca is not None,
@@ -175,6 +202,7 @@ def protocols(config: EvaluationConfig, image_size: int, rule: str, bank: Bank |
             precision=config.precision,
             stored="fp16" if config.store == "fp16" else "fp32",
             search=config.search,
+            refine=candidates(config.search, config),
             rerank=config.rerank,
             rerank_by=config.rerank_by if config.rerank else "patches",
             rerank_layer=config.rerank_layer if config.rerank else None,

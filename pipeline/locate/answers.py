@@ -111,7 +111,7 @@ class Locator:
             raise DataError(f"{photo}: its descriptor is not finite: the model has diverged; take another one")
         if index.projection is not None:
             described = index.projection(described)
-        squared, rows = search_index(index.index, described, min(count, len(index.photos)))
+        squared, rows = search_index(index.index, described, min(count, len(index.photos)), protocol.refine)
         kept = rows[0] >= 0  # an approximate search may find fewer
         own = taken(photo.name, source, index.about.get("given_zone", ""))
         found = [

@@ -36,7 +36,15 @@ from pipeline.evaluation.describe.encode import describe_each, evaluating
 from pipeline.evaluation.identity import Identity
 from pipeline.evaluation.protocol import Protocol, protocols, read_protocol
 from pipeline.evaluation.search.approximate import build_index, load_index, save_index
-from pipeline.evaluation.search.projection import Projection, fit_rows, load_projection, projected, sample_rows
+from pipeline.evaluation.search.projection import (
+    Prefix,
+    Projection,
+    check_prefix,
+    fit_rows,
+    load_projection,
+    projected,
+    sample_rows,
+)
 from pipeline.locate.descriptor_cache import KeptDescriptors
 from pipeline.locate.no_match import SAMPLE, Apart, Calibration, calibrate
 from pipeline.locate.photos import Photos, find_photos
@@ -88,7 +96,7 @@ class PhotoIndex:
     zone: str
     """Zone and hemisphere of UTM positions, "31N"; empty where it is not known."""
     protocol: Protocol
-    projection: Projection | None
+    projection: Projection | Prefix | None
     about: dict[str, Any]
     calibration: Calibration
     """From which distance on a photo is probably not on the map."""
@@ -112,9 +120,9 @@ def make_index(
 
     Args:
         sources: folders of photos, or manifests (`photos.find_photos`).
-        config: its `resize`, `precision`, `search`, `pca` and `pca_whiten` make the index, and the first of its
-            `groups`: `bank` (the model's own) or `single`; `batch` and `workers` its speed. A `batch` above 1 may
-            change the rounding of descriptors.
+        config: its `resize`, `precision`, `search`, `refine`, `prefix`, `pca` and `pca_whiten` make the index, and the
+            first of its `groups`: `bank` (the model's own) or `single`; `batch` and `workers` its speed. A `batch`
+            above 1 may change the rounding of descriptors.
         fingerprint: identifies the model (`identity.model_digest`).
         about: more to be kept in `about.json`, such as the checkpoint's path.
         zone: "31N", the UTM zone of metres that do not tell theirs.
@@ -128,10 +136,11 @@ def make_index(
     sources = [sources] if isinstance(sources, Path) else list(sources)
     groups: Any = ("bank",) if config.groups[0] == "bank" else ("single",)
     config = dataclasses.replace(
-        config, groups=groups, bank_from="train", bank=LARGEST, store="none", pca_from=None, rerank=0
+        config, groups=groups, bank_from="train", bank=LARGEST, store="none", pca_from=None, rerank=0, recalls=(1,)
     )
     bank = chosen_bank(model, config, (), device)
     protocol = protocols(config, int(model.image_size), "none", bank)[0]  # type: ignore[arg-type]
+    check_prefix(protocol.prefix, int(model.descriptor_dim))  # type: ignore[arg-type]
     apart = apart or Apart()
     photos = find_photos(sources, progress, zone)
     with _building(folder):
@@ -162,7 +171,9 @@ def make_index(
                 projection = fit_rows(blocks, sample, protocol.pca, protocol.whiten, name, device)
                 projection.save(place / PCA)
                 blocks = projected(blocks, projection)
-            built = build_index(blocks, config.search)
+            elif protocol.prefix:
+                blocks = projected(blocks, Prefix(protocol.prefix))
+            built = build_index(blocks, config.search, protocol.refine > 0)
             save_index(built, place / INDEX)
             asked = sample_rows(len(photos.files), SAMPLE)
             taken = np.concatenate([block[np.isin(rows, asked)] for rows, block in blocks()])
@@ -242,7 +253,9 @@ def _open(folder: Path, fingerprint: str) -> PhotoIndex:
     index = load_index(place / INDEX)
     if not len(photos) == about["photos"] == index.ntotal:
         raise DataError(f"{folder}: {index.ntotal} descriptors of {len(photos)} photos; build it again")
-    projection = load_projection(place / PCA) if protocol.pca else None
+    projection: Projection | Prefix | None = Prefix(protocol.prefix) if protocol.prefix else None
+    if protocol.pca:
+        projection = load_projection(place / PCA)
     coordinates, zone = about["coordinates"], about["zone"]
     return PhotoIndex(
         folder, index, photos, positions, degrees, coordinates, zone, protocol, projection, about, calibration

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.common.text import Table, csv_text
+from pipeline.evaluation.difference import interval_of
 from pipeline.evaluation.predictions import Predictions, load_predictions
-from pipeline.evaluation.report.significance import interval_of
 from pipeline.paper.measure import predictions_folder
 from pipeline.paper.plan import Cell
 from pipeline.paper.study import Study

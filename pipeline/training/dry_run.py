@@ -17,6 +17,7 @@ from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import ShardSets, open_shards
 from pipeline.distributed import agreed, collective_device, world_size
+from pipeline.evaluation.search.projection import check_prefix
 from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
 from pipeline.training.mining import Mining
 from shards.index import ShardIndex
@@ -56,6 +57,7 @@ def preview(config: RunConfig) -> list[tuple[str, str]]:
         config.model, backbone=replace(config.model.backbone, weights=None)
     )  # no file of weights is needed
     model = agreed(lambda: build_model(shapes, config.data.image_size), what="building the model")
+    check_prefix(max(config.loss.prefixes, default=None), model.descriptor_dim, "loss.prefixes")
     counts = parameter_counts(model)
     rows += [
         ("descriptor", f"{model.regions} regions x {model.pooling.dim} = {model.descriptor_dim} dimensions"),

@@ -10,6 +10,7 @@ are compared with each other, and an image's other descriptions are positives of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -49,6 +50,8 @@ class MultiSimilarityLoss(nn.Module):
         base: similarity threshold lambda.
         margin: mining margin.
         ignore_within: metres; a pair of two places closer than this is neither positive nor negative. 0: none is.
+        prefixes: the losses of the first so many dimensions, of unit length again, are added, each with its own mining
+            (Kusupati et al. 2022, Matryoshka Representation Learning, Eq. 1 with weights of 1). No more is gathered.
         points: [P, 3] float64, where place number p lies, in metres (pipeline.data.positions); NaN where unknown, and
             then near to nothing. The same on all ranks.
     """
@@ -63,8 +66,10 @@ class MultiSimilarityLoss(nn.Module):
         margin: float = 0.1,
         ignore_within: float = 0.0,
         points: Tensor | None = None,
+        prefixes: Sequence[int] = (),
     ) -> None:
         super().__init__()
+        self.prefixes = tuple(prefixes)
         self.alpha, self.beta, self.base, self.margin = alpha, beta, base, margin
         self.ignore_within = ignore_within
         self.register_buffer("points", points, persistent=False)
@@ -86,6 +91,8 @@ class MultiSimilarityLoss(nn.Module):
         Raises:
             ValueError: shapes do not fit.
         """
+        if any(dims > descriptors.shape[-1] for dims in self.prefixes):
+            raise ValueError(f"prefixes {self.prefixes} of descriptors {tuple(descriptors.shape)}")
         if descriptors.ndim != 2 or labels.ndim != 1 or not len(labels) or len(descriptors) % len(labels):
             raise ValueError(
                 f"descriptors {tuple(descriptors.shape)} need [p*b, dim] and labels {tuple(labels.shape)} [b]"
@@ -95,17 +102,22 @@ class MultiSimilarityLoss(nn.Module):
         labels = labels.repeat(passes)
         with torch.autocast(descriptors.device.type, enabled=False):
             own = F.normalize(descriptors.to(torch.promote_types(descriptors.dtype, torch.float32)), dim=1)
-            similarity = own @ gather(own).T  # [b, B]
+            others = gather(own)  # [B, dim]
+            similarities = [own @ others.T]  # [b, B]
+            for dims in self.prefixes:
+                cut = [F.normalize(part[:, :dims], dim=1) for part in (own, others)]
+                similarities.append(cut[0] @ cut[1].T)
         everyone = gather(labels)
         same = labels[:, None] == everyone[None, :]
         columns = torch.arange(len(everyone), device=labels.device)
         itself = columns == rank() * b + columns[:b, None]
         different = ~same & ~self._near(labels, everyone)
-        positive, negative = self.mine(similarity.detach(), same & ~itself, different)
-
-        push = self.soft_sum(-self.alpha * (similarity - self.base), positive) / self.alpha
-        pull = self.soft_sum(self.beta * (similarity - self.base), negative) / self.beta
-        local = (push + pull).mean()
+        local = own.new_zeros(())
+        for similarity in reversed(similarities):  # the whole descriptors last: the statistics are of their pairs
+            positive, negative = self.mine(similarity.detach(), same & ~itself, different)
+            push = self.soft_sum(-self.alpha * (similarity - self.base), positive) / self.alpha
+            pull = self.soft_sum(self.beta * (similarity - self.base), negative) / self.beta
+            local = local + (push + pull).mean()
 
         anchors = (positive.any(1) | negative.any(1)).view(passes, -1).sum(1)
         counts = torch.cat([anchors, positive.sum()[None], negative.sum()[None]])

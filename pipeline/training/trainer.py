@@ -36,6 +36,7 @@ from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import open_shards
 from pipeline.distributed import agree, agreed, broadcast_tensors, on_rank_0, rank, same, world_size
 from pipeline.evaluation.describe.bank import TrainingBank
+from pipeline.evaluation.search.projection import check_prefix
 from pipeline.model.bank import Bank, bank_beside, save_bank
 from pipeline.model.cross_image import check_crossing
 from pipeline.model.vpr import PlaceModel, build_model
@@ -137,6 +138,7 @@ class Trainer:
         # the model, from its config and the seed
         torch.manual_seed(config.seed)
         model = agreed(lambda: build_model(config.model, config.data.image_size), what="building the model")
+        check_prefix(max(config.loss.prefixes, default=None), model.descriptor_dim, "loss.prefixes")
         self.backbone_hash = frozen_hash(model)
         same(self.backbone_hash, "the hash of the frozen weights")
         self.saved = frozenset(saved_names(model, config.model, everything=False))
@@ -520,7 +522,7 @@ def build_loss(config: RunConfig, index: ShardIndex) -> MultiSimilarityLoss:
                 f"loss.ignore_within: {unknown:,} of {len(found):,} places have no position; no pair of theirs is "
                 "ignored", file=sys.stderr, flush=True,
             )  # fmt: skip
-    return MultiSimilarityLoss(loss.alpha, loss.beta, loss.base, loss.margin, loss.ignore_within, points)
+    return MultiSimilarityLoss(loss.alpha, loss.beta, loss.base, loss.margin, loss.ignore_within, points, loss.prefixes)
 
 
 def mined_metrics(mined: tuple[float, ...]) -> dict[str, float]:

@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 from tiny_checkpoint import save_tiny
 
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.evaluate import score
+from pipeline.evaluation.evaluate import Answers, score
 from pipeline.evaluation.predictions import load_predictions, save_predictions
 from pipeline.evaluation.protocol import protocols
 from pipeline.evaluation.report import tables
@@ -146,7 +146,7 @@ def test_results_and_predictions(folder: Path, count: int) -> None:
     config = EvaluationConfig(recalls=(1,), groups=("single",))
     evaluated = load_set(str(folder), config)
     rows, distances = np.tile(np.arange(4), (4, 1)), np.zeros((4, 4), np.float32)
-    result = score(evaluated, protocols(config, 224, evaluated.rule)[0], config, rows, distances)
+    result = score(evaluated, protocols(config, 224, evaluated.rule)[0], config, Answers(rows, distances))
     predictions, results = save_predictions(result, evaluated, folder), folder / "results.json"
     tables.write_json([result], results, {})
     tally = Tally()

@@ -103,7 +103,7 @@ def test_grown_is_the_same_as_built_at_once_and_only_the_new_is_described(
     assert all(f.stat().st_mtime_ns == when for f, when in before.items())  # nothing to do, nothing written
 
 
-@pytest.mark.parametrize("settings", [{"search": "hnsw"}, {"search": "ivfpq", "pca": 4}, {"pca": 5}])
+@pytest.mark.parametrize("settings", [{"search": "hnsw"}, {"search": "binary", "refine": 9, "prefix": 16}, {"pca": 5}])
 def test_other_ways_to_search_grow_alike(
     model: PlaceModel, photos: Path, tmp_path: Path, settings: dict[str, object]
 ) -> None:

@@ -76,6 +76,41 @@ def test_dimensions_and_radius_from_the_store_alone(home: Path, radius: float) -
     assert len({r["recalls"]["1"] for r in results}) > 2  # a table with something to see in it
 
 
+def test_small_descriptors_beside_the_whole_in_one_table_that_compare_reads(home: Path) -> None:
+    """The table's rows against numpy; codes refined among all rows answer as the floats do."""
+    out = home / "small"
+    stores = ["--from_store", str(home / "run" / "evaluation"), "--root", str(home / "data")]
+    ways = ["--prefixes", "8", "--dimensions", "8", "--searches", "int8,binary", "--refine", "24"]
+    options = [*ways, "--recalls", "1,3"]
+    text = finished("jobs.evaluate", home / "log", *stores, *options, "--output", str(out))
+    results = {r["protocol_name"]: r for r in json.loads((out / "results.json").read_text())["results"]}
+    assert len(results) == 2 * 3 * 5 and "bytes an image" in text and "R@1 - whole, 95 %" in text
+    where, base = described(home, "single_28px", "database")
+    asked_at, asked = described(home, "single_28px", "queries")
+    for short, dims in (("single", base.shape[1]), ("single_pca8", 8), ("single_prefix8", 8)):
+        floats = results[f"{short}_28px"]
+        assert floats["cost"]["bytes_each"] == 4 * dims
+        for kind, least in (("int8", dims), ("binary", dims / 8)):
+            codes, refined = results[f"{short}_28px_{kind}"], results[f"{short}_28px_{kind}_refine24"]
+            assert least <= codes["cost"]["bytes_each"] and codes["cost"]["refine_bytes"] == 0
+            assert refined["recalls"] == floats["recalls"] and refined["cost"]["refine_bytes"] == 4 * dims
+            against, whole = codes["against_whole"], results["single_28px"]
+            assert against["recalls"] == pytest.approx([whole["recalls"]["1"], codes["recalls"]["1"]])
+            change = 100 * (against["gained"] - against["lost"]) / against["queries"]
+            assert change == pytest.approx(against["recalls"][1] - against["recalls"][0])
+    cut, asked = (x[:, :8] / np.linalg.norm(x[:, :8], axis=1, keepdims=True) for x in (base, asked))
+    near = np.argmax(asked @ cut.T, axis=1)
+    found = 100 * float((np.linalg.norm(asked_at - where[near], axis=1) <= 25).mean())
+    assert results["single_prefix8_28px"]["recalls"]["1"] == pytest.approx(found)
+    assert "against_whole" not in results["single_28px"]
+    assert any("single_28px_int8_refine24 " in line and "+0.0 [+0.0, +0.0]" in line for line in text.splitlines())
+
+    again = home / "again"
+    shutil.copytree(out, again)
+    told = finished("jobs.compare", home / "log", "--evaluations", f"{out},{again}", "--output", str(home))
+    assert "single_prefix8_28px_binary_refine24" in told
+
+
 def test_what_is_missing_is_one_line(home: Path) -> None:
     stores = ("--from_store", str(home / "run" / "evaluation"), "--root", str(home / "data"))
     cases = [
@@ -86,6 +121,9 @@ def test_what_is_missing_is_one_line(home: Path) -> None:
         ((*stores, "--sets", "pitts30k"), 3, "pitts30k"),
         ((*stores, "--dimensions", "25"), 2, "PCA to 25 dimensions needs at least as many images"),
         ((*stores, "--dimensions", "0"), 2, "start at 1"),
+        ((*stores, "--prefixes", "9999"), 2, "prefix 9999: the descriptors have"),
+        ((*stores, "--searches", "int8", "--refine", "5"), 2, "refine 5 orders fewer candidates"),
+        (("--searches", "int8"), 2, "--searches goes with --from_store"),
     ]
     for options, code, message in cases:
         assert message in finished("jobs.evaluate", home / "log", *options, code=code)

@@ -1,96 +1,20 @@
-"""Is a difference between two recalls real? Paired bootstrap over the queries both were measured on.
+"""Runs compared query by query, from what their evaluations answered: `difference` on files of predictions.
 
 Invariant: only predictions of the same queries with the same positives under the same protocol are compared, query by
 query; what both found or both missed says nothing about which is better.
-
-A resample of Q queries with replacement holds (gained, lost, neither) queries as one draw of a multinomial with the
-observed shares, so resampling costs nothing, whatever Q is; the interval is the percentile interval (Efron and
-Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13). With few disagreeing queries that interval is too
-narrow, so a difference is called real only if McNemar's exact test agrees (McNemar, 1947: a sign test of the
-disagreeing queries). Both take queries as independent; neighbouring frames of a drive are not, and deserve more doubt.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.common.text import Table, csv_text, shown
+from pipeline.evaluation.difference import Difference, difference
 from pipeline.evaluation.predictions import Predictions, load_predictions
-
-SAMPLES = 10_000
-LEVEL = 0.95
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Recall@k of a second run minus that of a first one, in percentage points."""
-
-    set_name: str
-    protocol: str
-    k: int
-    runs: tuple[str, str]
-    recalls: tuple[float, float]
-    queries: int
-    gained: int
-    """Queries that only the second found."""
-    lost: int
-    """Queries that only the first found."""
-    low: float
-    high: float
-    """The 95 % interval of the difference."""
-    p_value: float
-    """McNemar's exact test, two-sided."""
-
-    @property
-    def value(self) -> float:
-        """Points; positive: the second run is better."""
-        return 100.0 * (self.gained - self.lost) / self.queries
-
-    @property
-    def real(self) -> bool:
-        """Whether the interval leaves zero out and the exact test agrees."""
-        return (self.low > 0 or self.high < 0) and self.p_value < 1 - LEVEL
-
-    @property
-    def text(self) -> str:
-        """`R@1 82.1 -> 84.2: difference +2.1 [+0.4, +3.9] real`"""
-        told = "real" if self.real else "not distinguishable"
-        change = f"{self.value:+.1f} [{self.low:+.1f}, {self.high:+.1f}]"
-        return f"R@{self.k} {self.recalls[0]:.1f} -> {self.recalls[1]:.1f}: difference {change} {told}"
-
-
-def paired_interval(gained: int, lost: int, queries: int, seed: int = 0, samples: int = SAMPLES) -> tuple[float, float]:
-    """The 95 % percentile interval, in points, of `100 * (gained - lost) / queries` under resampling of the queries."""
-    return _interval(np.array([1.0, -1.0, 0.0]), np.array([gained, lost, queries - gained - lost]), seed, samples)
-
-
-def interval_of(differences: np.ndarray, seed: int = 0, samples: int = SAMPLES) -> tuple[float, float]:
-    """The 95 % percentile interval, in points, of 100 times the mean of per-query differences [Q], each -1 to 1 (the
-    mean over several trainings, for example), under resampling of the queries."""
-    values, counts = np.unique(np.round(differences, 12), return_counts=True)
-    return _interval(values, counts, seed, samples)
-
-
-def _interval(values: np.ndarray, counts: np.ndarray, seed: int, samples: int) -> tuple[float, float]:
-    """Of queries with `counts` [n] of each of the differences `values` [n]."""
-    queries = int(counts.sum())
-    drawn = np.random.Generator(np.random.PCG64(seed)).multinomial(queries, counts / queries, samples)
-    low, high = np.quantile(drawn @ values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return 100.0 * float(low) / queries, 100.0 * float(high) / queries
-
-
-def mcnemar(gained: int, lost: int) -> float:
-    """Two-sided exact p-value that gains and losses are equally likely; 1 where nothing differs."""
-    if gained + lost == 0:
-        return 1.0
-    from scipy.stats import binomtest
-
-    return float(binomtest(gained, gained + lost, 0.5).pvalue)
 
 
 def differences(first: Predictions, second: Predictions, runs: tuple[str, str], ks: Sequence[int]) -> list[Difference]:
@@ -100,18 +24,12 @@ def differences(first: Predictions, second: Predictions, runs: tuple[str, str], 
     counted = np.ones(len(first.queries), bool)
     if first.protocol.without_positives == "drop":
         counted = np.fromiter((len(p) > 0 for p in first.positives), bool, len(counted))
-    queries = int(counted.sum())
-    found = []
-    for k in ks:
-        if queries == 0 or k > min(first.rows.shape[1], second.rows.shape[1]):
-            continue
-        hits = [((p.ranks >= 0) & (p.ranks < k))[counted] for p in (first, second)]
-        gained, lost = int((hits[1] & ~hits[0]).sum()), int((hits[0] & ~hits[1]).sum())
-        recalls = (100.0 * float(hits[0].mean()), 100.0 * float(hits[1].mean()))
-        interval = paired_interval(gained, lost, queries)
-        about = (first.set_name, first.protocol.name, k, runs, recalls, queries, gained, lost)
-        found.append(Difference(*about, *interval, mcnemar(gained, lost)))
-    return found
+    known = min(first.rows.shape[1], second.rows.shape[1])
+    return [
+        difference((first.set_name, first.protocol.name, k, runs), (first.ranks, second.ranks), counted)
+        for k in ks
+        if k <= known and counted.any()
+    ]
 
 
 def compare_folders(
@@ -120,7 +38,8 @@ def compare_folders(
     """Every later run against the first, on every set and protocol both have predictions of.
 
     Args:
-        runs: (name, folder of predictions); folders that are not there are told, not compared.
+        runs: (name, folder of an evaluation); what it scored from its stored descriptors counts as well. Folders
+            without predictions are told, not compared.
         every_pair: each run against each earlier one, not against the first alone.
 
     Returns:
@@ -131,11 +50,12 @@ def compare_folders(
     found: list[Difference] = []
     pairs = list(itertools.combinations(there, 2)) if every_pair else [(there[0], later) for later in there[1:]]
     for (base, base_folder), (name, folder) in pairs:
-        common = [file for file in _in(folder) if (base_folder / file).is_file()]
+        base_files, files = _in(base_folder), _in(folder)
+        common = [file for file in files if file in base_files]
         if not common:
             notes.append(f"{name} and {base} have no set and protocol in common")
         for file in common:
-            first, second = load_predictions(base_folder / file), load_predictions(folder / file)
+            first, second = load_predictions(base_files[file]), load_predictions(files[file])
             compared = differences(first, second, (base, name), ks)
             if not compared:
                 notes.append(f"{file}: {name} was measured on other queries, positives or settings than {base}")
@@ -182,8 +102,10 @@ def write_csv(found: Sequence[Difference], path: Path) -> None:
     path.write_text(csv_text(lines))
 
 
-def _in(folder: Path) -> list[str]:
-    return sorted(file.name for file in folder.glob("*.parquet"))
+def _in(evaluation: Path) -> dict[str, Path]:
+    """Name -> file of the predictions of an evaluation, then of those made from its store alone."""
+    found = [f for part in ("from_store/", "") for f in sorted(evaluation.glob(f"{part}predictions/*.parquet"))]
+    return {file.name: file for file in found}
 
 
 def _comparable(first: Predictions, second: Predictions) -> bool:

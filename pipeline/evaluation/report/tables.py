@@ -14,7 +14,7 @@ from typing import Any
 
 from pipeline.common.errors import DataError
 from pipeline.common.text import Table, csv_text, markdown_text, printable
-from pipeline.evaluation.evaluate import Result
+from pipeline.evaluation.evaluate import Result, SearchCost
 from pipeline.evaluation.protocol import Protocol, metric_name
 from pipeline.evaluation.report.paper_numbers import FIGURES, HEADLINE, Reported, reported
 from pipeline.evaluation.sets.registry import SETS, published_name
@@ -62,6 +62,14 @@ def table(results: Sequence[Result]) -> Table:
             row["queries"] = f"{result.queries:,}"
             row["database"] = f"{result.database:,}"
             row["no positive"] = f"{result.without_positives:,}" if result.recalls else "-"
+            if (cost := result.cost) is not None:
+                row["bytes an image"] = f"{cost.bytes_each:,}" + f" + {cost.refine_bytes:,}" * (cost.refine_bytes > 0)
+                row["ms a query"] = f"{cost.milliseconds:.3f}"
+            if (change := result.against) is not None:
+                against = f"R@{change.k} - whole, 95 %"
+                row[against] = f"{change.value:+.1f} [{change.low:+.1f}, {change.high:+.1f}]"
+                if change.real:
+                    row[against] += " real"
             row["paper R@1/5/10"] = _cells(paper)
             rows.append(row)
         headline = reported(set_name)
@@ -69,7 +77,8 @@ def table(results: Sequence[Result]) -> Table:
             theirs = f"paper: ordered{headline.group_size}, PCA 4096"
             recalls = {f"R@{k}": _percent(headline.at(k)) for k in ks}
             rows.append({"set": set_name, "protocol": theirs, **recalls, "paper R@1/5/10": _cells(headline)})
-    columns = list(rows[0]) if rows else ["set", "protocol"]
+    fullest: dict[str, str] = max(rows, key=len, default={"set": "", "protocol": ""})
+    columns = list(fullest)
     if not any(row["paper R@1/5/10"] != "-" for row in rows):
         columns = [c for c in columns if c != "paper R@1/5/10"]
     return Table(
@@ -129,6 +138,8 @@ def as_dicts(results: Iterable[Result]) -> list[dict[str, Any]]:
                 "database": result.database,
                 "without_positives": result.without_positives,
                 "remarks": list(result.remarks),
+                **({} if result.cost is None else {"cost": dataclasses.asdict(result.cost)}),
+                **({} if result.against is None else {"against_whole": dataclasses.asdict(result.against)}),
                 "paper": None if paper is None else {"recalls": paper.recalls, "group_size": paper.group_size},
             }
         )
@@ -156,11 +167,14 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_csv(results: Sequence[Result], path: Path) -> None:
     """One line for each set, protocol and N."""
     settings = list(results[0].protocol.to_dict()) if results else []
-    lines: list[list[Any]] = [["set", "protocol", "n", "recall", "queries", "database", "no_positive", *settings]]
+    costs = [field.name for field in dataclasses.fields(SearchCost)]
+    head = ["set", "protocol", "n", "recall", "queries", "database", "no_positive", *settings]
+    lines: list[list[Any]] = [head + costs * any(r.cost is not None for r in results)]
     for r in results:
         for k, value in r.recalls.items():
             counts = [r.queries, r.database, r.without_positives]
-            lines.append([r.set_name, r.protocol.name, k, value, *counts, *r.protocol.to_dict().values()])
+            cost = [] if r.cost is None else list(dataclasses.asdict(r.cost).values())
+            lines.append([r.set_name, r.protocol.name, k, value, *counts, *r.protocol.to_dict().values(), *cost])
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(csv_text(lines))
 

@@ -169,7 +169,27 @@ def fit_rows(
     )
 
 
-def projected(blocks: Blocks, projection: Projection) -> Blocks:
+def check_prefix(dims: int | None, of: int, setting: str = "prefix") -> None:
+    """Raises `UsageError` for more dimensions than descriptors have."""
+    if dims is not None and dims > of:
+        raise UsageError(f"{setting} {dims}: the descriptors have {of} dimensions; take fewer")
+
+
+@dataclass(frozen=True)
+class Prefix:
+    """x -> its first `dims` numbers, of unit length again: what a model trained with `loss.prefixes` makes short."""
+
+    dims: int
+
+    def __call__(self, descriptors: np.ndarray) -> np.ndarray:
+        """[n, D] -> [n, dims] float32. Raises `UsageError` where D is less than that."""
+        check_prefix(self.dims, descriptors.shape[1])
+        first = descriptors[:, : self.dims].astype(np.float32)
+        first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
+        return first
+
+
+def projected(blocks: Blocks, projection: Projection | Prefix) -> Blocks:
     """The same blocks, projected as they pass."""
     return lambda: ((numbers, projection(block)) for numbers, block in blocks())
 

@@ -175,7 +175,7 @@ def test_recalls_and_pca_tables_come_from_the_store_alone(tmp_path: Path) -> Non
     }
     for path in evaluated.database + evaluated.queries:
         path.unlink()
-    table = evaluate_stores(out, [evaluated], CONFIG, (None, 6, 2))
+    table = evaluate_stores(out, [evaluated], CONFIG, (6, 2))
     assert len(table) == 9
     for result in table:
         truth = next(r for r in direct[result.protocol.pca] if r.protocol == result.protocol)

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from pipeline.common.errors import UsageError
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.protocol import Protocol, metric_name, protocols
 
@@ -47,10 +48,24 @@ def test_names_differ_where_the_number_may() -> None:
     variants = [
         {}, {"group_size": 8}, {"group_seed": 5}, {"pca": 512}, {"pca": 512, "pca_whiten": True}, {"precision": "bf16"},
         {"resize": "published"}, {"without_positives": "drop"}, {"search": "hnsw"}, {"store": "fp16"},
+        {"search": "int8"}, {"search": "binary"}, {"search": "binary", "refine": 50}, {"prefix": 512},
     ]  # fmt: skip
     names = [list(by_name(dataclasses.replace(CONFIG, **v)))[1] for v in variants]  # type: ignore[arg-type]
     assert len(set(names)) == len(names) and all("@" not in name for name in names)
     assert list(by_name()) == ["single", "shuffled16", "ordered16"]
+
+
+def test_what_makes_descriptors_small_is_named_and_must_go_together() -> None:
+    config = dataclasses.replace(CONFIG, prefix=512, search="binary", refine=100)
+    protocol = by_name(config)["shuffled16_prefix512_binary_refine100"]
+    line = protocol.describe()
+    assert "the first 512 dimensions" in line and "binary L2 search, first 100 ordered anew by float" in line
+    assert protocol.grouping.prefix is None and protocol.grouping.refine == 0
+    assert list(by_name(dataclasses.replace(CONFIG, refine=100))) == list(by_name())  # floats have no codes to refine
+    with pytest.raises(UsageError, match="pca or prefix"):
+        by_name(dataclasses.replace(CONFIG, pca=8, prefix=8))
+    with pytest.raises(UsageError, match=r"refine 10 orders fewer candidates than are asked for \(20\)"):
+        by_name(dataclasses.replace(CONFIG, search="int8", refine=10))
 
 
 def test_description_names_everything_and_the_dict_rebuilds_it() -> None:

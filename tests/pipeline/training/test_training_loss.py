@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -107,6 +108,37 @@ def test_a_person_sees_the_mined_anchors_of_both_kinds_of_description(monkeypatc
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="need \\[p\\*b, dim\\]"):
         MultiSimilarityLoss()(torch.randn(4, 8), torch.zeros(5, dtype=torch.long))
+
+
+def prefix_loss(labels: torch.Tensor, x: torch.Tensor, prefixes: tuple[int, ...]) -> tuple[Any, ...]:
+    """This rank's part of a global batch: loss, gradient of the mean summed over ranks, and what was mined."""
+    mine = rank_slice(len(labels))
+    own = x[mine].clone().requires_grad_()
+    function = MultiSimilarityLoss(prefixes=prefixes)
+    loss = function(own, labels[mine])
+    loss.backward()
+    assert own.grad is not None
+    return loss.item(), own.grad / world_size(), function.statistics()
+
+
+def test_the_losses_of_prefixes_are_added_whatever_the_number_of_ranks() -> None:
+    """Against whole losses of cut descriptors; float64."""
+    generator = torch.Generator().manual_seed(3)
+    labels = torch.arange(6).repeat_interleave(4)
+    x = (torch.randn(6, 1, 12, generator=generator) + torch.randn(6, 4, 12, generator=generator)).reshape(24, 12)
+    x = x.double()
+    whole = x.clone().requires_grad_()
+    parts = [MultiSimilarityLoss()(whole[:, :dims], labels) for dims in (12, 7, 3)]
+    sum(parts).backward()  # type: ignore[union-attr]
+    assert whole.grad is not None and len({round(p.item(), 6) for p in parts}) == 3
+    mined = prefix_loss(labels, x, ())[2]
+    for world in (1, 2):
+        ranks = run_ranks(prefix_loss, world, labels, x, (7, 3))
+        assert [r[0] for r in ranks] == pytest.approx([sum(p.item() for p in parts)] * world, rel=1e-12)
+        torch.testing.assert_close(torch.cat([r[1] for r in ranks]), whole.grad, rtol=1e-10, atol=1e-14)
+        assert all(r[2] == mined for r in ranks)  # of the whole descriptors
+    with pytest.raises(ValueError, match="prefixes"):
+        MultiSimilarityLoss(prefixes=(13,))(x, labels)
 
 
 def near_loss(labels: torch.Tensor, x: torch.Tensor, points: torch.Tensor, within: float) -> tuple[float, torch.Tensor]:

@@ -202,6 +202,8 @@ def test_a_broken_image_in_the_shards_stops_the_run_naming_it(root: Path, tmp_pa
 
 def test_dry_run_tells_the_plan_and_writes_nothing(root: Path) -> None:
     out = train(config(root, "dry"), "--dry-run")
+    short = train(config(root, "dry"), "--dry-run", "--loss.prefixes", "8,9999", code=2)
+    assert "loss.prefixes 9999: the descriptors have" in short
     assert re.search(r"epoch\s+6 steps; 0 places wait", out)
     assert re.search(r"global batch\s+4 places x 4 = 16 images", out)
     assert not (root / "outputs/dry").exists()

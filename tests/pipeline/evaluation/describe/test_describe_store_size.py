@@ -43,11 +43,11 @@ def test_queries_in_batches_are_answered_as_all_at_once(monkeypatch: pytest.Monk
     whole = answer_queries(evaluated, used, CONFIG, described)  # type: ignore[arg-type]
     monkeypatch.setattr(exact, "QUERY_BYTES", 600)  # 14 queries at a time
     assert [len(rows) for rows, _ in exact.batches(described["queries"])] == [14] * 6 + [6]  # type: ignore[arg-type]
-    rows, distances, remarks = answer_queries(evaluated, used, CONFIG, described)  # type: ignore[arg-type]
+    found = answer_queries(evaluated, used, CONFIG, described)  # type: ignore[arg-type]
     if search != "hnsw":
-        assert (rows == np.argsort(far, 1)[:, :4]).all()
-    assert (rows == whole[0]).all() and remarks == whole[2]
-    np.testing.assert_allclose(distances, np.take_along_axis(far, rows, 1), rtol=1e-4)
+        assert (found.rows == np.argsort(far, 1)[:, :4]).all()
+    assert (found.rows == whole.rows).all() and found.remarks == whole.remarks
+    np.testing.assert_allclose(found.distances, np.take_along_axis(far, found.rows, 1), rtol=1e-4)
 
 
 def test_made_stores_are_what_they_say(tmp_path: Path) -> None:
@@ -96,14 +96,14 @@ def test_no_step_needs_more_memory_for_four_times_the_rows(tmp_path: Path) -> No
     assert all(value < 150 for value in grown.values()), grown
 
 
-@pytest.mark.parametrize("kind", ["exact", "hnsw"])
+@pytest.mark.parametrize("kind", ["exact", "hnsw", "binary"])  # binary: refined by floats
 def test_an_opened_index_stays_on_the_disk(tmp_path: Path, kind: str) -> None:
     """The kernel has the file's vectors mapped, all of them, and they answer."""
     vectors = np.random.Generator(np.random.PCG64(0)).random((500, 2_000), np.float32) + 1
     vectors[:3] = np.eye(3, 2_000)
-    approximate.save_index(approximate.build_index(partial(exact.slices, vectors), kind), tmp_path / "index")
+    approximate.save_index(approximate.build_index(partial(exact.slices, vectors), kind, True), tmp_path / "index")
     index = approximate.load_index(tmp_path / "index")
     mapped = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if str(tmp_path) in line]
     bounds = [[int(end, 16) for end in fields[0].split("-")] for fields in mapped]
     assert sum(end - start for start, end in bounds) >= vectors.nbytes
-    assert approximate.search_index(index, np.eye(3, 2_000, dtype=np.float32), 1)[1][:, 0].tolist() == [0, 1, 2]
+    assert approximate.search_index(index, np.eye(3, 2_000, dtype=np.float32), 1, 500)[1][:, 0].tolist() == [0, 1, 2]

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.evaluate import score
+from pipeline.evaluation.evaluate import Answers, score
 from pipeline.evaluation.protocol import protocols
 from pipeline.evaluation.report import figures
 from pipeline.evaluation.report.error_plots import areas
@@ -85,7 +85,7 @@ def test_the_report_is_seen_whole_and_asks_nobody(tmp_path: Path) -> None:
     positives = [np.array([q], np.int64) for q in range(4)]
     street = EvaluationSet("street", photos, photos[:4], positives, "pairs")
     rows, far = np.array([[0, 1], [1, 2], [3, 2], [4, 5]]), np.ones((4, 2), np.float32)
-    result = score(street, protocols(config, 224, "pairs")[0], config, rows, far)
+    result = score(street, protocols(config, 224, "pairs")[0], config, Answers(rows, far))
     pictures = draw([result], [street], tmp_path / "figures")
     page = tmp_path / "report.html"
     write_page([result], pictures, page, "Street", {"checkpoint": "none"})

@@ -12,18 +12,11 @@ import pytest
 from job_process import JobProcess
 
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.evaluate import score
+from pipeline.evaluation.difference import interval_of, mcnemar, paired_interval
+from pipeline.evaluation.evaluate import Answers, score
 from pipeline.evaluation.predictions import Predictions, load_predictions, save_predictions
 from pipeline.evaluation.protocol import protocols
-from pipeline.evaluation.report.significance import (
-    as_text,
-    compare_folders,
-    differences,
-    interval_of,
-    mcnemar,
-    paired_interval,
-    write_csv,
-)
+from pipeline.evaluation.report.significance import as_text, compare_folders, differences, write_csv
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 
 CONFIG = EvaluationConfig(recalls=(1, 5), groups=("single",))
@@ -39,7 +32,9 @@ def measured(folder: Path, ranks: np.ndarray, without: int = 0, policy: str = "m
     rows[np.arange(queries) >= queries - 2] = 0
     rows[ranks >= 0, ranks[ranks >= 0]] = np.flatnonzero(ranks >= 0)
     config = dataclasses.replace(CONFIG, without_positives=policy)  # type: ignore[arg-type]
-    result = score(evaluated, protocols(config, 224, "pairs")[0], config, rows, np.ones((queries, 5), np.float32))
+    result = score(
+        evaluated, protocols(config, 224, "pairs")[0], config, Answers(rows, np.ones((queries, 5), np.float32))
+    )
     return load_predictions(save_predictions(result, evaluated, folder))
 
 
@@ -112,14 +107,15 @@ def test_differences_of_two_evaluations(tmp_path: Path) -> None:
 
 def test_only_like_is_compared_with_like(tmp_path: Path) -> None:
     ranks = np.zeros(20, np.int64)
-    measured(tmp_path / "a", ranks), measured(tmp_path / "b", ranks), measured(tmp_path / "few", ranks[:19])
+    for name, found in (("a", ranks), ("b/from_store", ranks), ("few", ranks[:19])):
+        measured(tmp_path / name / "predictions", found)
     runs = [(name, tmp_path / name) for name in ("a", "b", "few", "none")]
-    found, notes = compare_folders(runs)
-    assert [d.runs for d in found] == [("a", "b")] * 2  # N = 1 and 5; there are no ten answers
+    compared, notes = compare_folders(runs)
+    assert [d.runs for d in compared] == [("a", "b")] * 2  # N = 1 and 5; there are no ten answers
     assert any("few was measured on other queries" in n for n in notes) and any(
         "none: no predictions" in n for n in notes
     )
-    write_csv(found, tmp_path / "differences.csv")
+    write_csv(compared, tmp_path / "differences.csv")
     with (tmp_path / "differences.csv").open() as file:
         assert [row["real"] for row in csv.DictReader(file)] == ["False"] * 2
 

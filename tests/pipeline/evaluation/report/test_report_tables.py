@@ -15,7 +15,7 @@ from PIL import Image
 
 from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
-from pipeline.evaluation.evaluate import Result, score
+from pipeline.evaluation.evaluate import Answers, Result, score
 from pipeline.evaluation.predictions import load_predictions, save_predictions
 from pipeline.evaluation.protocol import protocols
 from pipeline.evaluation.recall import recall_at
@@ -55,7 +55,7 @@ def results_of(evaluated: EvaluationSet, config: EvaluationConfig = CONFIG) -> l
         predictions = np.stack([rng.permutation(30)[:10] for _ in range(12)])
         predictions[:5, 0] = 2 * np.arange(5)  # right at first
         distances = np.sort(rng.random((12, 10)).astype(np.float32), axis=1)
-        made.append(score(evaluated, protocol, config, predictions, distances))
+        made.append(score(evaluated, protocol, config, Answers(predictions, distances)))
     return made
 
 

@@ -11,8 +11,10 @@ from PIL import Image
 from pipeline.common.errors import DataError
 from pipeline.evaluation.recall import recall_at
 from pipeline.evaluation.search.approximate import (
+    CODES,
     agreement,
     build_index,
+    bytes_each,
     index_bytes,
     load_index,
     save_index,
@@ -72,7 +74,7 @@ def test_parts() -> None:
         assert (found[q] == truth).all()
 
 
-@pytest.mark.parametrize(("kind", "least"), [("exact", 100.0), ("hnsw", 97.0), ("ivfpq", 30.0)])
+@pytest.mark.parametrize(("kind", "least"), [("exact", 100), ("hnsw", 97), ("ivfpq", 30), ("int8", 97), ("binary", 15)])
 def test_an_index_agrees_with_exact_as_measured_and_survives_the_disk(kind: str, least: float, tmp_path: Path) -> None:
     database, queries = descriptors(2000, 32), descriptors(50, 32, seed=1)
     exact = search(queries, slices(database), 10)[1]
@@ -84,11 +86,51 @@ def test_an_index_agrees_with_exact_as_measured_and_survives_the_disk(kind: str,
     assert (search_index(load_index(tmp_path / "index.faiss"), queries, 10)[1] == found).all()
     assert abs((tmp_path / "index.faiss").stat().st_size - index_bytes(index)) < 200
     assert (search_index(build_index(lambda: shuffled, kind), queries, 10)[1] == found).all()  # seeded
-    if kind == "ivfpq":
+    if kind in CODES:
         assert index_bytes(index) < database.nbytes  # with its tables; far less at scale
     (tmp_path / "broken").write_bytes(b"nothing of the kind")
     with pytest.raises(DataError, match="broken"):
         load_index(tmp_path / "broken")
+
+
+@pytest.mark.parametrize("kind", CODES)
+def test_floats_order_the_candidates_of_codes(kind: str, tmp_path: Path) -> None:
+    """With as many candidates as rows that is the exact answer; with few it is exact among what the codes found."""
+    database, queries = descriptors(400, 30), descriptors(20, 30, seed=1)  # 30: not a multiple of 8 bits
+    exact = search(queries, slices(database), 6)
+    shuffled = [(rows[::-1].copy(), block[::-1].copy()) for rows, block in slices(database, 64)]
+    codes, both = (build_index(lambda: shuffled, kind, refine) for refine in (False, True))
+    if kind != "ivfpq":  # which looks into a part of its lists
+        distances, rows = search_index(both, queries, 6, refine=1_000)
+        assert (rows == exact[1]).all()
+        np.testing.assert_allclose(distances, exact[0], atol=2e-6)
+    near = search_index(codes, queries, 12)[1]
+    save_index(both, tmp_path / "index.faiss")
+    for index in (both, load_index(tmp_path / "index.faiss")):
+        distances, rows = search_index(index, queries, 6, refine=12)
+        for q, candidates in enumerate(near):
+            far = ((queries[q] - database[candidates[candidates >= 0]]) ** 2).sum(1)
+            assert (rows[q] == candidates[np.argsort(far, kind="stable")][:6]).all()
+    assert agreement(rows, exact[1]) > agreement(near[:, :6], exact[1]) or kind == "int8"
+    codes_alone, with_floats = bytes_each(codes), bytes_each(both)
+    assert codes_alone == (with_floats[0], 0) and with_floats[1] == 120
+    if kind != "ivfpq":
+        least = {"int8": 30, "binary": 4}[kind]
+        assert least <= codes_alone[0] < least + 4  # and the ranges or means of 30 dimensions
+
+
+def test_codes_are_what_they_say() -> None:
+    """Distances of binary codes count differing sides of the means; those of int8 codes are within half a step."""
+    database, queries = descriptors(200, 24), descriptors(9, 24, seed=1)
+    middle, low, step = database.mean(0), database.min(0), np.ptp(database, axis=0) / 255
+    differing = ((queries > middle)[:, None] != (database > middle)[None]).sum(-1)
+    distances, rows = search_index(build_index(lambda: slices(database, 50), "binary"), queries, 200)
+    assert (distances == np.take_along_axis(differing, rows, 1)).all()
+    assert (np.sort(rows, 1) == np.arange(200)).all()
+    coded = low + (np.clip(np.floor((database - low) / step), 0, 254.999) + 0.5) * step  # the middle of each step
+    distances, rows = search_index(build_index(lambda: slices(database, 50), "int8"), queries, 200)
+    truth = ((queries[:, None] - coded[None]) ** 2).sum(-1)
+    np.testing.assert_allclose(distances, np.take_along_axis(truth, rows, 1), atol=0.01)
 
 
 def test_agreement_counts_found_neighbours() -> None:

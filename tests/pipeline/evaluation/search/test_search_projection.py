@@ -11,13 +11,23 @@ import pytest
 
 from pipeline.common.errors import DataError, UsageError
 from pipeline.evaluation.search.exact import slices
-from pipeline.evaluation.search.projection import fit_rows, load_projection, projected, sample_rows
+from pipeline.evaluation.search.projection import Prefix, fit_rows, load_projection, projected, sample_rows
 
 
 def data(n: int, dim: int) -> np.ndarray:
     rng = np.random.Generator(np.random.PCG64(n))
     mixed = rng.normal(size=(n, dim)) * np.geomspace(3, 0.05, dim) @ np.linalg.qr(rng.normal(size=(dim, dim)))[0]
     return (mixed + 0.7).astype(np.float32)
+
+
+def test_a_prefix_has_unit_length_again() -> None:
+    x = data(50, 12).astype(np.float16)
+    ((rows, short),) = projected(lambda: slices(x), Prefix(5))()
+    cut = x[:, :5].astype(np.float64)
+    np.testing.assert_allclose(short, cut / np.linalg.norm(cut, axis=1, keepdims=True), atol=1e-6)
+    assert short.dtype == np.float32 and (rows == np.arange(50)).all()
+    with pytest.raises(UsageError, match="prefix 13: the descriptors have 12 dimensions"):
+        Prefix(13)(x)
 
 
 @pytest.mark.parametrize(("n", "dim"), [(500, 40), (40, 90)])  # covariance, and Gram matrix
