@@ -142,9 +142,11 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def temporary_files(folder: Path) -> list[str]:
-    """Files with content in the folder for temporary files, and in shared memory; a killed process cannot remove the
-    empty folders and sockets of Python's `multiprocessing`."""
-    shared = [file for file in Path("/dev/shm").glob("*") if file.name.startswith(("torch_", "sem.mp-"))]
+    """Files with content in the folder for temporary files, and in shared memory those of processes that are gone
+    (`torch_<process>_...`; a living one may belong to a test beside this one); a killed process cannot remove the empty
+    folders and sockets of Python's `multiprocessing`."""
+    shared = [file for file in Path("/dev/shm").glob("torch_*") if not Path("/proc", file.name.split("_")[1]).exists()]
+    shared += Path("/dev/shm").glob("sem.mp-*")
     return sorted(str(file) for file in [*folder.rglob("*"), *shared] if file.is_file() and file.stat().st_size)
 
 

@@ -12,6 +12,12 @@ import time
 import traceback
 from pathlib import Path
 
+# what jobs import when they need it, imported once, in the parent
+IMPORTED = (
+    "accelerate", "faiss", "pandas", "pipeline.evaluation.evaluate", "pipeline.training.trainer", "pyarrow.parquet",
+    "transformers.models.dinov2.modeling_dinov2",
+)  # fmt: skip
+
 
 class JobProcess:
     """`python -m MODULE ARGUMENTS`, its output in a file."""
@@ -19,10 +25,8 @@ class JobProcess:
     def __init__(
         self, module: str, arguments: list[str], output: Path, environment: dict[str, str] | None = None
     ) -> None:
-        import accelerate  # noqa: F401  what every job would import, once, in the parent
-        import transformers.models.dinov2.modeling_dinov2  # noqa: F401
-
-        importlib.import_module(module)
+        for name in (*IMPORTED, module):
+            importlib.import_module(name)
         self.output = output
         self._process = multiprocessing.get_context("fork").Process(
             target=_run, args=(module, arguments, output, environment or {})

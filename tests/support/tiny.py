@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from job_process import JobProcess
 from PIL import Image
 
 HEADER = "place_id,year,month,northdeg,city_id,lat,lon,panoid\n"
@@ -71,15 +75,20 @@ def run_settings(root: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def prepare(root: Path, places: int = 24) -> Path:
-    """Draws photos and writes shards and the evaluation folder under `root`, with the project's own command."""
-    import subprocess
-    import sys
-
+@cache
+def _prepared(places: int) -> TemporaryDirectory[str]:
+    made = TemporaryDirectory(prefix="tiny-")
+    root = Path(made.name)
     make_gsv(root / "gsv", places)
     make_evaluation(root / "evaluation")
-    command = [sys.executable, "-m", "jobs.prepare", "--source", str(root / "gsv"), "--out", str(root / "shards")]
-    subprocess.run([*command, "--rounds", "2"], check=True, capture_output=True)
+    arguments = ["--source", str(root / "gsv"), "--out", str(root / "shards"), "--rounds", "2", "--workers", "1"]
+    assert JobProcess("jobs.prepare", arguments, root / "prepare.log").wait() == 0
+    return made
+
+
+def prepare(root: Path, places: int = 24) -> Path:
+    """Puts drawn photos, shards that the project's own command made of them, and the evaluation folder under `root`."""
+    shutil.copytree(_prepared(places).name, root, dirs_exist_ok=True)
     return root
 
 
