@@ -27,7 +27,9 @@ class ExperimentJob(RunConfig):
 
     table: str = ""
     """ablation_crica, ablation_adaptation, dimensions, epochs, encoder_layers, train_batch, inference_batch, kernels,
-    spm, same_data, or parts, mined, one_photo (ours; the last with paired intervals between rows)."""
+    spm, same_data, or parts, mined, one_photo (ours; the last two with paired intervals between rows)."""
+    rows: tuple[str, ...] = ()
+    """Rows to fill, for example '[group, joint]'; none: all of the table."""
     seeds: tuple[int, ...] = (0,)
     """Train every row with each seed, as `0,1,2`; the table shows mean and standard deviation."""
     sets: tuple[str, ...] = ()
@@ -59,10 +61,10 @@ def main() -> None:
         return
     if not job.table:
         raise UsageError("--table is missing, for example --table ablation_crica")
-    from pipeline.paper.rows import table
+    from pipeline.paper.rows import table, with_rows
 
-    wanted_table = table(job.table)
-    from pipeline.paper import study, table_report
+    wanted_table = with_rows(table(job.table), job.rows) if job.rows else table(job.table)
+    from pipeline.paper import paired, study, table_report
     from pipeline.paper.runner import Runner
 
     base = RunConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(RunConfig)})
@@ -79,8 +81,9 @@ def main() -> None:
         raise DataError(f"no evaluation set of the table is there: give --root or --sets ({'; '.join(filled.missing)})")
     filled.fill()
     folder = Path(job.output) / "tables" / job.table
-    table_report.write(filled, folder)
-    table_report.show(filled)
+    compared = list(paired.paired(filled))
+    table_report.write(filled, compared, folder)
+    table_report.show(filled, compared)
     print(f"\nwritten to {folder}/: table.md, table.csv, table.png")
 
 

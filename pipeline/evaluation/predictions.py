@@ -47,9 +47,9 @@ class Predictions:
     """int64 [Q]: recall@n is the mean of (0 <= ranks) & (ranks < n)"""
 
 
-def predictions_path(folder: Path, result: Result) -> Path:
+def predictions_path(folder: Path, set_name: str, protocol: Protocol) -> Path:
     """`<folder>/<set>.<protocol>.parquet`"""
-    return folder / f"{result.set_name}.{result.protocol.name}.parquet"
+    return folder / f"{set_name}.{protocol.name}.parquet"
 
 
 def save_predictions(result: Result, evaluated: EvaluationSet, folder: Path) -> Path:
@@ -64,7 +64,7 @@ def save_predictions(result: Result, evaluated: EvaluationSet, folder: Path) -> 
             "rank": pa.array(first_hits(result.predictions, evaluated.positives)),
         }
     ).replace_schema_metadata({META: json.dumps(about)})
-    path = predictions_path(folder, result)
+    path = predictions_path(folder, result.set_name, result.protocol)
     with replacing(path) as fresh:
         pq.write_table(table, fresh, compression="zstd")
     return path

@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.common.text import Table, csv_text
 from pipeline.evaluation.difference import interval_of
-from pipeline.evaluation.predictions import Predictions, load_predictions
+from pipeline.evaluation.predictions import Predictions, load_predictions, predictions_path
 from pipeline.paper.measure import predictions_folder
 from pipeline.paper.plan import Cell
 from pipeline.paper.study import Study
@@ -90,10 +90,12 @@ def _predictions(study: Study, set_name: str, row: str, grouping: str) -> dict[i
 
 
 def _files(study: Study, cell: Cell, grouping: str) -> list[Path]:
-    loaded = study.sets[cell.set_name]
+    protocol = study.protocols.get((cell.row, cell.set_name), {}).get(grouping)
+    if protocol is None:
+        return []
     folder = predictions_folder(study.runner.run_folder(cell.training), cell)
-    names = [p.name for p in cell.protocols(loaded.rule) if p.groups == grouping]
-    return [file for name in names if (file := folder / f"{loaded.name}.{name}.parquet").is_file()]
+    file = predictions_path(folder, study.sets[cell.set_name].name, protocol)
+    return [file] if file.is_file() else []
 
 
 def table(found: Sequence[Paired]) -> Table:

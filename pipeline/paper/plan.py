@@ -17,7 +17,6 @@ from typing import Any
 from pipeline.common.errors import UsageError
 from pipeline.config import EvaluationConfig, ModelConfig, RunConfig, flatten
 from pipeline.config.setting import changing
-from pipeline.evaluation.protocol import Protocol, protocols
 from pipeline.evaluation.report import paper_numbers
 from pipeline.model.variants import VARIANTS, variant
 from pipeline.paper.rows import DEPTH, DIMENSIONS, EPOCHS, PLACES, Row
@@ -57,10 +56,6 @@ class Cell:
         """Ten hex digits of the set and everything its recalls depend on: the name of its results."""
         told = {k: v for k, v in flatten(self.config).items() if k in changing(EvaluationConfig, "numbers")}
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:10]
-
-    def protocols(self, rule: str) -> list[Protocol]:
-        """The protocols of its results, in order."""
-        return protocols(self.config, self.training.config.data.image_size, rule)
 
 
 def training(

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.evaluation.protocol import metric_name
+from pipeline.evaluation.protocol import metric_name, protocols
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.paper.plan import Cell, Training
 from pipeline.paper.runner import Recalls
@@ -20,6 +20,9 @@ from pipeline.training.records.tracking import open_client, store_uri
 def recorded(training: Training, cells: Sequence[Cell], sets: Mapping[str, EvaluationSet]) -> dict[str, Recalls]:
     """Recalls of a finished training, by `Cell.key`: a table can be printed where the run folders are not.
 
+    Metrics have the protocols' names alone, so these are looked for under the names that the configuration gives. A
+    bank that turned out smaller than asked for has another name: then nothing is found, and the cell is measured again.
+
     Args:
         sets: `Cell.set_name` -> the set, whose name and rule stand in metrics.
     """
@@ -27,11 +30,13 @@ def recorded(training: Training, cells: Sequence[Cell], sets: Mapping[str, Evalu
     found: dict[str, Recalls] = {}
     for cell in cells:
         recalls: Recalls = {}
-        name, chosen = sets[cell.set_name].name, cell.protocols(sets[cell.set_name].rule)
+        loaded = sets[cell.set_name]
+        chosen = protocols(cell.config, training.config.data.image_size, loaded.rule)
         for protocol in chosen:
-            values = {k: metrics.get("evaluation/" + metric_name(name, protocol, k)) for k in cell.config.recalls}
+            names = {k: metric_name(loaded.name, protocol, k) for k in cell.config.recalls}
+            values = {k: metrics.get(f"evaluation/{name}") for k, name in names.items()}
             if all(value is not None for value in values.values()):
-                recalls[name, protocol.name] = {k: float(v) for k, v in values.items() if v is not None}
+                recalls[loaded.name, protocol] = {k: float(v) for k, v in values.items() if v is not None}
         if recalls and len(recalls) == len(chosen):
             found[cell.key] = recalls
     return found

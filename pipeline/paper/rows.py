@@ -7,7 +7,9 @@ proportion to the base configuration, so that a table has the same rows at every
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -81,16 +83,24 @@ def _mined() -> dict[str, Row]:
     orders: dict[str, dict[str, Any]] = {
         "city": {"data.order": "city"},
         "mined": {"data.order": "mined", "data.mine_from": "single"},
-        "mined, permuted": {"data.order": "mined", "data.mine_from": "permuted"},
+        "permuted": {"data.order": "mined", "data.mine_from": "permuted"},
         "mined, near ignored": {"data.order": "mined", "data.mine_from": "single", "loss.ignore_within": 25.0},
     }
     passes: dict[str, dict[str, Any]] = {"": {"train.passes": "group"}, "+joint": {"train.passes": "joint"}}
     near = {"loss.ignore_within": 0.0}
     return {
-        name + ending: Row(changes=near | order | way)
+        name + ending: Row(changes=near | order | way, groups=("single", "bank"))
         for ending, way in passes.items()
         for name, order in orders.items()
     }
+
+
+MINED_PAIRS = tuple(
+    ((first + ending, grouping), (second + ending, grouping))
+    for ending in ("", "+joint")
+    for first, second in (("city", "mined"), ("permuted", "mined"), ("mined", "mined, near ignored"))
+    for grouping in ("single", "bank")
+)
 
 
 TABLES: dict[str, Table] = {
@@ -198,7 +208,7 @@ TABLES: dict[str, Table] = {
             ),
         },
     ),
-    "mined": Table("Mined batches, and what they are compared with (a table of ours)", _mined()),
+    "mined": Table("Mined batches, and what they are compared with (a table of ours)", _mined(), paired=MINED_PAIRS),
 }
 
 
@@ -209,3 +219,11 @@ def table(name: str) -> Table:
     near = difflib.get_close_matches(name, TABLES, n=1, cutoff=0.5)
     hint = f"did you mean '{near[0]}'? " if near else ""
     raise UsageError(f"unknown table '{name}'; {hint}known: {', '.join(TABLES)}")
+
+
+def with_rows(whole: Table, names: Sequence[str]) -> Table:
+    """The table with the rows of these names alone, in its own order. Raises `UsageError` for one it does not have."""
+    for name in names:
+        if name not in whole.rows:
+            raise UsageError(f"--rows: the table has no row '{name}'; it has {', '.join(map(repr, whole.rows))}")
+    return dataclasses.replace(whole, rows={name: row for name, row in whole.rows.items() if name in names})

@@ -22,12 +22,13 @@ from typing import Any
 
 from pipeline.common.errors import Diverged, Preempted, UserError
 from pipeline.config import to_dict
+from pipeline.evaluation.protocol import Protocol, read_protocol
 from pipeline.evaluation.report import tables
 from pipeline.paper.measure import results_file, write_order
 from pipeline.paper.plan import Cell, Training
 
-Recalls = dict[tuple[str, str], dict[int, float]]
-"""(set, protocol name) -> N -> Recall@N in percent."""
+Recalls = dict[tuple[str, Protocol], dict[int, float]]
+"""(set, protocol) -> N -> Recall@N in percent."""
 
 
 class StepFailed(UserError):
@@ -111,11 +112,11 @@ class Runner:
         path = results_file(self.run_folder(cell.training), cell)
         if not path.is_file():
             return None
-        entries = tables.read_json(path)["results"]
-        return {
-            (entry["set"], entry["protocol_name"]): {int(k): float(v) for k, v in entry["recalls"].items()}
-            for entry in entries
-        }
+        found: Recalls = {}
+        for entry in tables.read_json(path)["results"]:
+            protocol = read_protocol(entry["protocol"], str(path))
+            found[entry["set"], protocol] = {int(k): float(v) for k, v in entry["recalls"].items()}
+        return found
 
     def _start(self, module: str, *arguments: str) -> int:
         """Runs a job to its end; its exit code. A signal is handed on, waited for, and raised as `Preempted`."""

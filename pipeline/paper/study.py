@@ -15,6 +15,7 @@ from pathlib import Path
 
 from pipeline.common.errors import DataError, Diverged, UsageError
 from pipeline.config import EvaluationConfig, RunConfig
+from pipeline.evaluation.protocol import Protocol
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.evaluation.sets.load import load_set
 from pipeline.evaluation.sets.registry import published_name
@@ -38,6 +39,8 @@ class Study:
         notes: row -> why it has no numbers, or not all.
         uses: (row, name of a training it needs).
         values: filled in by `fill`: (row, short name of the set, protocol name) -> N -> Recall@N for each seed.
+        protocols: filled in by `fill`: (row, `Cell.set_name`) -> grouping -> the protocol its values were measured
+            under, without the digest of a bank, of which each training has its own.
     """
 
     name: str
@@ -52,6 +55,7 @@ class Study:
     notes: dict[str, str] = field(default_factory=dict)
     uses: list[tuple[str, str]] = field(default_factory=list)
     values: dict[tuple[str, str, str], dict[int, list[float]]] = field(default_factory=dict)
+    protocols: dict[tuple[str, str], dict[str, Protocol]] = field(default_factory=dict)
 
     def fill(self, run: bool = True) -> None:
         """Trains and evaluates what is missing (`run`), then collects the values.
@@ -83,7 +87,9 @@ class Study:
     def _take(self, cell: Cell, recalls: Recalls) -> None:
         for (name, protocol), values in recalls.items():
             for k, value in values.items():
-                self.values.setdefault((cell.row, name, protocol), {}).setdefault(k, []).append(value)
+                self.values.setdefault((cell.row, name, protocol.name), {}).setdefault(k, []).append(value)
+            known = self.protocols.setdefault((cell.row, cell.set_name), {})
+            known[protocol.groups] = dataclasses.replace(protocol, bank_digest="")
 
     def images_to_train(self) -> int | None:
         """Of the trainings not finished, at most; None while shards are missing."""

@@ -7,10 +7,11 @@ and standard deviation are over seeds (trainings), never over sets or groupings.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from pipeline.common.text import Table, csv_text, markdown_text, printable
+from pipeline.evaluation.protocol import Protocol
 from pipeline.evaluation.sets.registry import published_name
 from pipeline.paper import paired
 from pipeline.paper.chart import draw
@@ -30,7 +31,7 @@ def table(study: Study, set_name: str) -> Table:
     theirs = paper_set(study, loaded)
     sized = {paper_figure(study, row, loaded) for row in study.table.rows} - {None}
     batches = {f.group_size for f in sized if f is not None}
-    batch = f"ordered{batches.pop()}" if len(batches) == 1 else "ordered"
+    batch = ordered(batches.pop()) if len(batches) == 1 else "ordered"
     with_settings = any(study.settings.get(row) for row in study.table.rows)
     head = [study.table.axis or "row", *(["here"] if with_settings else [])]
     for g in groupings:
@@ -50,6 +51,11 @@ def table(study: Study, set_name: str) -> Table:
         line.append(_cell(["-" if found is None else f"{found:.1f}" for found in at]))
         rows.append(line)
     return Table(head, rows)
+
+
+def ordered(size: int) -> str:
+    """Name of the paper's protocol with groups of so many images."""
+    return Protocol(groups="ordered", group_size=size).name
 
 
 def _cell(figures: list[str]) -> str:
@@ -92,34 +98,37 @@ def _fewer(study: Study) -> bool:
     return any(len(v) < len(study.seeds) for by_n in study.values.values() for v in by_n.values())
 
 
-def show(study: Study) -> None:
-    """Prints the tables of all sets, the notes below."""
+def show(study: Study, compared: Sequence[paired.Paired]) -> None:
+    """Prints the tables of all sets, the differences, the notes below."""
     print(study.table.title)
     for set_name in study.sets:
         print("\n" + printable(heading(study, set_name)))
         table(study, set_name).print()
-    if compared := list(paired.paired(study)):
+    if compared:
         print(f"\n{PAIRED}")
         paired.table(compared).print()
     print("\n" + "\n".join(map(printable, notes(study))))
 
 
-def markdown(study: Study) -> str:
+def markdown(study: Study, compared: Sequence[paired.Paired]) -> str:
     """The same as markdown."""
     out = [f"# {study.table.title}", ""]
     for set_name in study.sets:
         out += [markdown_text(heading(study, set_name)), "", table(study, set_name).markdown()]
-    if compared := list(paired.paired(study)):
+    if compared:
         out += [PAIRED, "", paired.table(compared).markdown()]
     return "\n".join([*out, *(f"- {markdown_text(note)}" for note in notes(study))]) + "\n"
 
 
-def write(study: Study, folder: Path) -> None:
-    """`table.md`, `table.csv` (one line a row, set, protocol and N), `table.png`, and `paired.csv` in `folder`."""
+def write(study: Study, compared: Sequence[paired.Paired], folder: Path) -> None:
+    """`table.md`, `table.csv` (one line a row, set, protocol and N), `table.png`, and `paired.csv` in `folder`.
+
+    `compared`: from `paired.paired`.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "table.md").write_text(markdown(study))
+    (folder / "table.md").write_text(markdown(study, compared))
     (folder / "table.csv").write_text(csv_text(_long_form(study)))
-    if compared := list(paired.paired(study)):
+    if compared:
         (folder / "paired.csv").write_text(paired.csv(compared))
     draw(study, folder / "table.png")
 
@@ -142,8 +151,8 @@ def _long_form(study: Study) -> Iterator[list[object]]:
                     theirs: list[object] = ["", "", "", ""]
                     if figure is not None:
                         told = figure.at(k)
-                        size = f"ordered{figure.group_size}"
-                        theirs = ["" if told is None else told, paper_set(study, loaded), size, figure.table]
+                        paper = [paper_set(study, loaded), ordered(figure.group_size), figure.table]
+                        theirs = ["" if told is None else told, *paper]
                     yield [study.name, row, *ours, *theirs]
 
 

@@ -63,10 +63,5 @@ def _reported(study: Study, row: str, set_name: str) -> Reported | None:
 
 
 def by_row(study: Study, set_name: str) -> dict[str, dict[str, Protocol]]:
-    """Row -> grouping (single, shuffled, ordered) -> its protocol on a set."""
-    rule = study.sets[set_name].rule
-    found: dict[str, dict[str, Protocol]] = {}
-    for cell in study.cells:
-        if cell.set_name == set_name:
-            found.setdefault(cell.row, {}).update({p.groups: p for p in cell.protocols(rule)})
-    return found
+    """Row -> grouping (single, shuffled, ordered, bank) -> the protocol its values on a set were measured under."""
+    return {row: study.protocols[row, set_name] for row in study.table.rows if (row, set_name) in study.protocols}

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from pipeline.evaluation.protocol import Protocol
+
 Recalls = tuple[float | None, float | None, float | None]
 """Recall@1, 5 and 10 in percent."""
 
@@ -207,9 +209,9 @@ def table_row(table: str, row: str) -> dict[str, Reported]:
 
 
 def _protocol(name: str, table: str, row: str, size: int) -> str:
-    groups = "single" if size == 1 else f"ordered{size}"
-    kept = {"sota": "4096", "dimensions": row}.get(table, "10752")
-    return groups if kept == "10752" else f"{groups}_pca{kept}"
+    kept = int({"sota": "4096", "dimensions": row}.get(table, "10752"))
+    pca = None if kept == 10752 else kept
+    return Protocol(groups="single" if size == 1 else "ordered", group_size=size, pca=pca).name
 
 
 def _figures() -> dict[tuple[str, str, str], Reported]:

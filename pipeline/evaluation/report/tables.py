@@ -74,7 +74,7 @@ def table(results: Sequence[Result]) -> Table:
             rows.append(row)
         headline = reported(set_name)
         if headline is not None and not matched:
-            theirs = f"paper: ordered{headline.group_size}, PCA 4096"
+            theirs = f"paper: {Protocol(groups='ordered', group_size=headline.group_size).name}, PCA 4096"
             recalls = {f"R@{k}": _percent(headline.at(k)) for k in ks}
             rows.append({"set": set_name, "protocol": theirs, **recalls, "paper R@1/5/10": _cells(headline)})
     fullest: dict[str, str] = max(rows, key=len, default={"set": "", "protocol": ""})
