@@ -35,13 +35,13 @@ class WeightsJob:
 
     source: str = ""
     """A run or checkpoint folder, a file of ours, a released CricaVPR or DINOv2 .pth, a release of another method
-    (CosPlace, EigenPlaces, MixVPR, SALAD, BoQ, NetVLAD, SFRS, GCL), a transformers folder, or hub:OWNER/NAME
+    (CosPlace, EigenPlaces, MixVPR, SALAD, BoQ, NetVLAD, SFRS, GCL, TransVPR), a transformers folder, or hub:OWNER/NAME
     (asked of the model hub, if it is not on this machine already)."""
     to: str = ""
     """The file to write: .safetensors, .pth or .onnx; none: only say what the source is."""
     kind: Literal[
         "auto", "model", "cricavpr", "backbone",
-        "cosplace", "mixvpr", "salad", "boq", "netvlad", "sfrs", "gcl", "gcl_avg", "gem",
+        "cosplace", "mixvpr", "salad", "boq", "netvlad", "sfrs", "gcl", "gcl_avg", "gem", "transvpr",
     ] = "auto"  # fmt: skip
     """What the source must be; auto looks. cosplace is EigenPlaces too; gcl_avg must be said, its average pooling
     leaves no trace in the file."""

@@ -21,7 +21,7 @@ import pytest
 import yaml
 from job_process import JobProcess
 from tiny import make_evaluation, make_gsv, photo, run_settings
-from tiny_matchers import netvlad
+from tiny_matchers import netvlad, transvpr
 
 from pipeline.model.weights.files import save_model
 
@@ -199,8 +199,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (world / "outputs/cricavpr/checkpoints/best/model.safetensors").resolve(),
         world / "weights" / "resnet50_gem.safetensors",
     )
-    model = netvlad()
-    save_model(model, world / "weights" / "patch_netvlad.safetensors", model.config, model.image_size, everything=True)
+    for name, model in (("patch_netvlad", netvlad()), ("transvpr", transvpr())):
+        save_model(model, world / "weights" / f"{name}.safetensors", model.config, model.image_size, everything=True)
     return world
 
 

@@ -164,12 +164,14 @@ class EvaluationConfig(Settings):
     rerank: int = setting(0, changes="numbers", at_least=0, at_most=10_000)
     """Re-rank this many first candidates by matching patches in space; 0: none. Reads their images again; not for
     validation during training."""
-    rerank_by: Literal["patches", "patch-netvlad", "patch-netvlad-rss"] = setting("patches", changes="numbers")
+    rerank_by: Literal["patches", "patch-netvlad", "patch-netvlad-rss", "transvpr"] = setting(
+        "patches", changes="numbers"
+    )
     """rerank: how. patches (ours): patch tokens of any backbone; patch-netvlad: NetVLAD of patches of three sizes, with
-    RANSAC (needs OpenCV) or rapid spatial scoring (-rss)."""
+    RANSAC (needs OpenCV) or rapid spatial scoring (-rss); transvpr: its key patches, with RANSAC."""
     rerank_layer: int | None = setting(None, changes="numbers", at_least=1)
     """rerank: block (transformer) or stage (ResNet, VGG) whose patches are matched, from 1; none: the last
-    (patches)."""
+    (patches) or the fourth (transvpr)."""
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,37 @@ class VGGConfig(Settings):
 
 
 @dataclass(frozen=True)
+class TransVPRConfig(Settings):
+    """TransVPR's stem and transformer (Wang et al., CVPR 2022)."""
+
+    dim: int = setting(256, changes="numbers", at_least=4, at_most=8192)
+    """Channels of a token after a block, a multiple of 4 x heads (published: 256)."""
+    depth: int = setting(6, changes="numbers", at_least=1, at_most=100)
+    """Transformer blocks (published: 6)."""
+    heads: int = setting(4, changes="numbers", at_least=1, at_most=1024)
+    """Attention heads of a block (published: 4)."""
+    mlp_ratio: int = setting(2, changes="numbers", at_least=1, at_most=16)
+    """Hidden width of the MLP divided by dim (published: 2)."""
+    width: int = setting(64, changes="numbers", at_least=1, at_most=4096)
+    """Channels of the stem's first stage; each of its four stages has twice as many (published: 64)."""
+    levels: tuple[int, ...] = setting((2, 4, 6), changes="numbers", at_least=1, at_most=100)
+    """Blocks whose tokens are pooled, from 1 (published: 2, 4, 6)."""
+    dropout: float = setting(0.1, changes="numbers", at_least=0, below=1)
+    """Dropout of tokens, attention and MLP (published: 0.1)."""
+    skipped: float = setting(0.1, changes="numbers", at_least=0, below=1)
+    """Largest probability that an image leaves out a branch in training; it grows from block to block (published:
+    0.1)."""
+
+
+@dataclass(frozen=True)
+class AttentionMapsConfig(Settings):
+    """TransVPR's pooling: an attention map for each level of tokens."""
+
+    levels: int = setting(3, changes="numbers", at_least=1, at_most=100)
+    """Levels that a token holds side by side; as many as backbone.transvpr.levels names (published: 3)."""
+
+
+@dataclass(frozen=True)
 class NetVLADConfig(Settings):
     """Residuals to soft-assigned cluster centres (Arandjelovic et al., CVPR 2016)."""
 

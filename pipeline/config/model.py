@@ -9,12 +9,14 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from pipeline.config.baselines import (
+    AttentionMapsConfig,
     BoQConfig,
     CosPlaceConfig,
     MixVPRConfig,
     NetVLADConfig,
     ResNetConfig,
     SALADConfig,
+    TransVPRConfig,
     VGGConfig,
 )
 from pipeline.config.setting import Settings, setting
@@ -23,10 +25,10 @@ BackboneName = Literal[
     "dinov2_vits14", "dinov2_vitb14", "dinov2_vitl14", "dinov2_vitg14",
     "dinov2_vits14_reg", "dinov2_vitb14_reg", "dinov2_vitl14_reg", "dinov2_vitg14_reg",
     "dinov3_vits16", "dinov3_vits16plus", "dinov3_vitb16", "dinov3_vitl16", "dinov3_vith16plus",
-    "resnet18", "resnet34", "resnet50", "resnet101", "resnet152", "resnext101_32x8d", "vgg16",
+    "resnet18", "resnet34", "resnet50", "resnet101", "resnet152", "resnext101_32x8d", "vgg16", "transvpr",
     "custom", "resnet_custom",
 ]  # fmt: skip
-PoolingKind = Literal["spm", "spmg", "gem", "cls", "netvlad", "cosplace", "mixvpr", "salad", "boq"]
+PoolingKind = Literal["spm", "spmg", "gem", "cls", "netvlad", "cosplace", "mixvpr", "salad", "boq", "transvpr"]
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,8 @@ class BackboneConfig(Settings):
     """The image encoder. `name` fills the sizes; `custom` and `resnet_custom` take them from the fields below."""
 
     name: BackboneName = setting("dinov2_vitb14", changes="numbers")
-    """DINOv2 (paper: ViT-B/14 without registers), with registers, DINOv3, a residual network, VGG-16, or custom."""
+    """DINOv2 (paper: ViT-B/14 without registers), with registers, DINOv3, a residual network, VGG-16,
+    TransVPR's, or custom."""
     weights: str | None = setting(None, changes="numbers", resume="free")
     """Released weights: a .pth, a safetensors file, a transformers folder, or hub:OWNER/NAME; none: random
     weights."""
@@ -64,6 +67,8 @@ class BackboneConfig(Settings):
     """Residual networks: the part used, the origin of the weights, sizes of resnet_custom."""
     vgg: VGGConfig = field(default_factory=VGGConfig)
     """VGG-16: the part used and the origin of the weights."""
+    transvpr: TransVPRConfig = field(default_factory=TransVPRConfig)
+    """TransVPR's: sizes."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +98,7 @@ class PoolingConfig(Settings):
 
     kind: PoolingKind = setting("spm", changes="numbers")
     """spm: pyramid, class token as its first level (paper); spmg: GeM on all levels; gem: one GeM; cls: class token;
-    netvlad, cosplace, mixvpr, salad, boq: the aggregators of those methods, set below."""
+    netvlad, cosplace, mixvpr, salad, boq, transvpr: the aggregators of those methods, set below."""
     levels: tuple[int, ...] = setting((1, 2, 3), changes="numbers", at_least=1, at_most=64)
     """Pyramid levels n, each of n x n cells (paper: 1, 2, 3, so 14 regions)."""
     p: float = setting(3.0, changes="numbers", above=0, at_most=1000)
@@ -110,6 +115,8 @@ class PoolingConfig(Settings):
     """SALAD."""
     boq: BoQConfig = field(default_factory=BoQConfig)
     """BoQ."""
+    transvpr: AttentionMapsConfig = field(default_factory=AttentionMapsConfig)
+    """TransVPR."""
 
 
 @dataclass(frozen=True)

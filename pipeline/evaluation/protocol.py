@@ -28,6 +28,7 @@ SECOND_STAGES = {
     "patches": "matching patches in space",
     "patch-netvlad": "Patch-NetVLAD (RANSAC)",
     "patch-netvlad-rss": "Patch-NetVLAD (rapid spatial scoring)",
+    "transvpr": "TransVPR's key patches (RANSAC)",
 }
 Side = Literal["database", "queries"]
 WORD = 40  # characters of a value in a protocol's name

@@ -76,6 +76,14 @@ BASELINES: dict[str, dict[str, Any]] = {
     "ResNet50-BoQ": _resnet("layer3", 1) | _pool("boq", channels=512),
     "ResNet50-SPM": _resnet("layer4", 2),
     "ResNet50-SPM+Crica": _resnet("layer4", 2) | {"cross_image.layers": 2},
+    "TransVPR": NO_CRICA
+    | _pool("transvpr")
+    | {
+        "adapter.kind": "none",
+        "trainable": "full",
+        "backbone.name": "transvpr",
+        "backbone.weights": None,
+    },  # its own backbone, which starts at random
     # on DINOv2, what one would pick today
     "SALAD": _dinov2(4) | _pool("salad"),
     "BoQ": _dinov2(2) | _pool("boq") | {"backbone.final_norm": False},

@@ -17,6 +17,7 @@ from pipeline.config import ModelConfig
 from pipeline.model.aggregators import build_pooling
 from pipeline.model.backbones.resnet import ResNet, is_resnet
 from pipeline.model.backbones.transformer import Backbone
+from pipeline.model.backbones.transvpr import TransVPR
 from pipeline.model.backbones.vgg import VGG
 from pipeline.model.bank import Bank
 from pipeline.model.batch_norm import GlobalBatchNorm2d
@@ -24,6 +25,7 @@ from pipeline.model.chunked import in_step, recomputed
 from pipeline.model.cross_image import CrossImageEncoder, Memory, check_crossing
 from pipeline.model.pooling import at_least_float32
 
+Network = Backbone | ResNet | VGG | TransVPR
 BESIDE = 8  # images in a call beside a bank: one alone pays for eight, which is 5 % of its way through ViT-B
 
 
@@ -45,8 +47,9 @@ class PlaceModel(nn.Module):
         self.config = config
         self.image_size = image_size
         name = config.backbone.name
-        kind: type[Backbone | ResNet | VGG] = ResNet if is_resnet(name) else VGG if name == "vgg16" else Backbone
-        self.backbone: Backbone | ResNet | VGG = kind(config, image_size)
+        others: dict[str, type[ResNet | VGG | TransVPR]] = {"vgg16": VGG, "transvpr": TransVPR}
+        kind: type[Network] = ResNet if is_resnet(name) else others.get(name, Backbone)
+        self.backbone: Network = kind(config, image_size)
         self.pooling = build_pooling(config.pooling, self.backbone.dim, self.backbone.grid)
         self.cross_image = CrossImageEncoder(self.pooling.dim, config.cross_image)
         self.regions = self.pooling.regions
@@ -74,7 +77,7 @@ class PlaceModel(nn.Module):
         if chunk < 1:
             raise UsageError(f"train.encode_chunk {chunk} must be at least 1")
         if any(isinstance(m, GlobalBatchNorm2d) and m.training for m in self.modules()):
-            if isinstance(self.backbone, ResNet):
+            if isinstance(self.backbone, (ResNet, TransVPR)):
                 tokens = self.backbone(images, recompute=True)
             else:
                 assert isinstance(self.backbone, Backbone)  # VGG has no BatchNorm

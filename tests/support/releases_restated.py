@@ -321,3 +321,71 @@ def boq(state: State, x: Tensor) -> Tensor:
         i += 1
     rows = F.linear(torch.cat(answers, 1).transpose(1, 2), state["aggregator.fc.weight"], state["aggregator.fc.bias"])
     return F.normalize(rows.flatten(1), dim=1)
+
+
+def transvpr_shapes(dim: int, depth: int, width: int, levels: int = 3) -> Shape:
+    """TransVPR: four stages, tokens of each, a transformer, attention pooling."""
+    shapes: Shape = {"transformer.class_emb": (1, 1, dim)}
+    channels = 3
+    for i in range(4):
+        out = width * 2**i
+        shapes |= {f"conv{i + 1}.0.weight": (out, channels, 3, 3), f"conv{i + 1}.0.bias": (out,)}
+        shapes |= {f"conv{i + 1}.1.{part}": (out,) for part in ("weight", "bias", "running_mean", "running_var")}
+        shapes |= {f"conv{i + 1}.1.num_batches_tracked": ()}
+        name, side = f"tokenizer{i + 1}.conv_layer", 8 // 2**i
+        shapes |= {f"{name}.weight": (dim // 4, out, side, side), f"{name}.bias": (dim // 4,)}
+        channels = out
+    norms = ["transformer.norm"]
+    for i in range(depth):
+        block = f"transformer.blocks.{i}."
+        norms += [f"{block}pre_norm", f"{block}norm1"]
+        shapes |= {f"{block}self_attn.qkv.weight": (3 * dim, dim)} | linear_shapes(f"{block}self_attn.proj", dim, dim)
+        shapes |= linear_shapes(f"{block}linear1", 2 * dim, dim) | linear_shapes(f"{block}linear2", dim, 2 * dim)
+    for name in norms:
+        shapes |= {f"{name}.weight": (dim,), f"{name}.bias": (dim,)}
+    shapes |= linear_shapes("pool.fc.1", dim, levels * dim)
+    return shapes | linear_shapes("pool.attention_pool", levels, levels * dim)
+
+
+def transvpr_tokens(state: State, x: Tensor) -> list[Tensor]:
+    """[b, 3, H, W] -> for each block [b, 1 + h*w, D] under the final norm; heads of 64."""
+
+    def norm(x: Tensor, name: str) -> Tensor:
+        return F.layer_norm(x, x.shape[-1:], state[f"{name}.weight"], state[f"{name}.bias"])
+
+    def linear(x: Tensor, name: str) -> Tensor:
+        return F.linear(x, state[f"{name}.weight"], state.get(f"{name}.bias"))
+
+    parts = []
+    for i in range(1, 5):
+        mean, var, weight, bias = (state[f"conv{i}.1.{p}"] for p in ("running_mean", "running_var", "weight", "bias"))
+        x = F.conv2d(x, state[f"conv{i}.0.weight"], state[f"conv{i}.0.bias"], padding=1)
+        x = F.max_pool2d(F.batch_norm(x, mean, var, weight, bias, False, 0.0, 1e-5).relu(), 3, 2, 1)
+        name = f"tokenizer{i}.conv_layer"
+        parts.append(F.conv2d(x, state[f"{name}.weight"], state[f"{name}.bias"], stride=2 ** (4 - i)).flatten(2))
+    x = torch.cat(parts, 1).transpose(1, 2)
+    x = torch.cat((state["transformer.class_emb"].expand(len(x), -1, -1), x), 1)
+    found: list[Tensor] = []
+    while (block := f"transformer.blocks.{len(found)}.") + "norm1.weight" in state:
+        q, k, v = linear(norm(x, f"{block}pre_norm"), f"{block}self_attn.qkv").unflatten(-1, (3, -1, 64)).unbind(2)
+        scores = torch.einsum("bqhd,bkhd->bhqk", q, k) / 8
+        mixed = torch.einsum("bhqk,bkhd->bqhd", scores.softmax(-1), v).flatten(2)
+        x = norm(x + linear(mixed, f"{block}self_attn.proj"), f"{block}norm1")
+        x = x + linear(F.gelu(linear(x, f"{block}linear1")), f"{block}linear2")
+        found.append(norm(x, "transformer.norm"))
+    return found
+
+
+def transvpr_maps(state: State, every: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Tokens of the blocks -> patches of the second, fourth and sixth side by side [b, N, 3 D], maps [b, 3, N]."""
+    x = torch.cat([every[i][:, 1:] for i in (1, 3, 5)], -1)
+    scores = F.linear(x, state["pool.attention_pool.weight"], state["pool.attention_pool.bias"])
+    return x, scores.softmax(1).transpose(1, 2)
+
+
+def transvpr(state: State, x: Tensor) -> Tensor:
+    """[b, 3, H, W] -> [b, D]."""
+    x, maps = transvpr_maps(state, transvpr_tokens(state, x))
+    sums = [maps[:, i : i + 1] @ part for i, part in enumerate(x.chunk(3, -1))]
+    found = F.normalize(torch.cat(sums, -1).squeeze(1), dim=-1)
+    return F.normalize(F.linear(found, state["pool.fc.1.weight"], state["pool.fc.1.bias"]), dim=-1)

@@ -1,4 +1,4 @@
-"""Patch-NetVLAD's second stage, restated: its patches' descriptors and its matching.
+"""Patch-NetVLAD's and TransVPR's second stages, restated: what they describe and how they match.
 
 Written from the public code that pipeline/evaluation/search/rerank names, in plain torch and NumPy; nothing of the
 project is used.
@@ -74,3 +74,28 @@ def patch_order(scores: list[list[float]]) -> list[int]:
     for column, weight in zip(np.array(scores).T, WEIGHTS, strict=True):
         whole += weight * (column - column.mean()) / column.std()
     return list(np.argsort(whole, kind="stable"))
+
+
+def key_mask(maps: Tensor) -> Tensor:
+    """Attention maps [3, N] -> weights [N], from 0 to 1."""
+
+    def scaled(x: Tensor) -> Tensor:
+        low, high = x.min(-1, keepdim=True).values, x.max(-1, keepdim=True).values
+        return (x - low) / (high - low)
+
+    return scaled(scaled(maps).sum(0))
+
+
+def key_score(query: Tensor, candidate: Tensor, masks: tuple[Tensor, Tensor], side: int) -> tuple[int, bool]:
+    """Patches [N, D] and their weights -> matches in agreement, and whether the first patches of both are no key
+    patches but a match, as zeros are."""
+    similar = candidate @ query.T
+    similar[:, masks[0] <= 0.02] = 0
+    similar[masks[1] <= 0.02, :] = 0
+    to_candidate, to_query = similar.argmax(0), similar.argmax(1)
+    kept = [i for i in range(len(query)) if int(to_query[to_candidate[i]]) == i]
+    places = np.linspace(8, 16 * side - 8, side, dtype=int)
+    left, right = (
+        [(places[int(i) % side], places[int(i) // side]) for i in rows] for rows in (kept, to_candidate[kept])
+    )
+    return ransac(left, right, 24), bool(masks[0][0] <= 0.02 and masks[1][0] <= 0.02)

@@ -17,6 +17,7 @@ from pipeline.model.aggregators.cosplace import CosPlace
 from pipeline.model.aggregators.mixvpr import MixVPR
 from pipeline.model.aggregators.netvlad import NetVLAD
 from pipeline.model.aggregators.salad import SALAD
+from pipeline.model.aggregators.transvpr import AttentionMaps
 from pipeline.model.pooling import Pooling
 
 AGGREGATORS: dict[str, Callable[[PoolingConfig, int, int], nn.Module]] = {
@@ -25,6 +26,7 @@ AGGREGATORS: dict[str, Callable[[PoolingConfig, int, int], nn.Module]] = {
     "mixvpr": lambda config, dim, grid: MixVPR(config.mixvpr, dim, grid),
     "salad": lambda config, dim, grid: SALAD(config.salad, dim, grid),
     "boq": lambda config, dim, grid: BoQ(config.boq, dim, grid),
+    "transvpr": lambda config, dim, grid: AttentionMaps(config.transvpr, dim),
 }
 
 

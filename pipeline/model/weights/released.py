@@ -29,6 +29,7 @@ from pipeline.model.weights.released_layouts import (
     salad,
     sfrs,
     shape_text,
+    transvpr,
 )
 
 RELEASES: dict[str, str] = {
@@ -40,6 +41,7 @@ RELEASES: dict[str, str] = {
     "sfrs": "a released SFRS",
     "gcl": "a released GCL with GeM",
     "gcl_avg": "a released GCL with average pooling",
+    "transvpr": "a released TransVPR",
     "gem": "a released GeM (the visual geo-localisation benchmark's)",
     "unpooled": "a backbone whose pooling left no tensors, as in GCL's releases with average pooling",
 }
@@ -50,6 +52,7 @@ MARKS: list[tuple[str, str]] = [
     ("mixvpr", r"aggregator\.mix\.0\.mix\.0\.weight"),
     ("salad", r"aggregator\.dust_bin"),
     ("boq", r"aggregator\.boqs\.0\.queries"),
+    ("transvpr", r"transformer\.class_emb"),
     ("cosplace", r"aggregation\.3\.weight"),
     ("gem", r"aggregation\.[01]\.p"),
     ("gcl", r"pool\.p"),
@@ -63,6 +66,7 @@ LAYOUTS: dict[str, Callable[[Shapes], Layout]] = {
     "sfrs": sfrs,
     "gcl": lambda shapes: gcl(shapes, average=False),
     "gcl_avg": lambda shapes: gcl(shapes, average=True),
+    "transvpr": transvpr,
     "gem": gem,
 }
 

@@ -5,7 +5,8 @@ Invariant: a layout is read off names and shapes alone. Sources (public code, re
 tests/pipeline/model/test_model_releases.py): CosPlace and EigenPlaces: `GeoLocalizationNet` of gmberton/CosPlace and
 gmberton/EigenPlaces; MixVPR: amaralibey/MixVPR; SALAD: serizba/salad; BoQ: amaralibey/Bag-of-Queries; NetVLAD:
 Nanne/pytorch-NetVlad, QVPR/Patch-NetVLAD (its global descriptor), and the deep visual geo-localisation benchmark, as is
-GeM; SFRS: yxgeee/OpenIBL; GCL: marialeyvallina/generalized_contrastive_loss.
+GeM; SFRS: yxgeee/OpenIBL; GCL: marialeyvallina/generalized_contrastive_loss; TransVPR:
+RuotongWANG/TransVPR-model-implementation.
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ from torch import Tensor
 from pipeline.common.errors import UsageError
 from pipeline.config import BackboneConfig, ModelConfig
 from pipeline.config.baselines import (
+    AttentionMapsConfig,
     BoQConfig,
     CosPlaceConfig,
     MixVPRConfig,
     NetVLADConfig,
     ResNetConfig,
     SALADConfig,
+    TransVPRConfig,
     VGGConfig,
 )
 from pipeline.model.backbones.resnet import BASIC, GROUPS, STAGES
@@ -301,6 +304,28 @@ def boq(shapes: Shapes) -> Layout:
     config = _model(base, backbone, boq=settings)
     unused = r"^backbone\.dino\.norm\."
     return Layout("boq", config, size, (*rules, AGGREGATOR), unused=unused, optional=optional)
+
+
+def transvpr(shapes: Shapes) -> Layout:
+    """TransVPR: heads are 64 wide and the levels evenly spread over the blocks, as in its only published size."""
+    dim, depth = shapes.of("transformer.class_emb", 3)[2], shapes.count(r"transformer\.blocks\.(\d+)\.")
+    levels = shapes.of("pool.attention_pool.weight", 2)[0]
+    if dim % 64 or depth % levels:
+        raise shapes.refuse(f"a transformer of {depth} blocks of width {dim} with {levels} levels, not known here")
+    settings = TransVPRConfig(
+        dim=dim,
+        depth=depth,
+        heads=dim // 64,
+        mlp_ratio=shapes.of("transformer.blocks.0.linear1.weight", 2)[0] // dim,
+        width=shapes.of("conv1.0.weight", 4)[0],
+        levels=tuple(depth // levels * i for i in range(1, levels + 1)),
+    )
+    backbone = BackboneConfig(name="transvpr", transvpr=settings)
+    config = _model("TransVPR", backbone, transvpr=AttentionMapsConfig(levels=levels))
+    rules: tuple[Rule, ...] = (
+        (r"^backbone\.", ""), (r"^pooling\.fc\.", "pool.fc.1."), (r"^pooling\.", "pool."),
+    )  # fmt: skip
+    return Layout("transvpr", config, 480, rules)
 
 
 AGGREGATOR: Rule = (r"^pooling\.", "aggregator.")

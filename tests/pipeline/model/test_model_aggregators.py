@@ -12,7 +12,14 @@ from torch import Tensor, nn
 
 from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig, PoolingConfig
-from pipeline.config.baselines import BoQConfig, CosPlaceConfig, MixVPRConfig, NetVLADConfig, SALADConfig
+from pipeline.config.baselines import (
+    BoQConfig,
+    CosPlaceConfig,
+    MixVPRConfig,
+    NetVLADConfig,
+    SALADConfig,
+    TransVPRConfig,
+)
 from pipeline.model.aggregators import AGGREGATORS, build_pooling
 from pipeline.model.aggregators.netvlad import NetVLAD, k_means
 from pipeline.model.aggregators.salad import transport
@@ -134,7 +141,15 @@ def boq(w: dict[str, np.ndarray], image: np.ndarray) -> np.ndarray:
     return (np.concatenate(answers).T @ w["fc.weight"].T + w["fc.bias"]).ravel()
 
 
-TRUTHS = {"netvlad": netvlad, "cosplace": cosplace, "mixvpr": mixvpr, "salad": salad, "boq": boq}
+def transvpr(w: dict[str, np.ndarray], image: np.ndarray) -> np.ndarray:
+    """Three levels of four channels; a map for each."""
+    x = image[1:]
+    maps = softmax((x @ w["attention_pool.weight"].T + w["attention_pool.bias"]).T)  # [3, 25]
+    sums = [sum(maps[level, i] * x[i, 4 * level : 4 * level + 4] for i in range(len(x))) for level in range(3)]
+    return w["fc.weight"] @ unit(np.concatenate(sums)) + w["fc.bias"]
+
+
+TRUTHS = {"netvlad": netvlad, "cosplace": cosplace, "mixvpr": mixvpr, "salad": salad, "boq": boq, "transvpr": transvpr}
 
 
 def test_every_aggregator_has_a_truth() -> None:
@@ -175,7 +190,7 @@ def test_who_looks_at_the_order_of_patches(kind: str, tokens: Tensor) -> None:
     shuffled = torch.cat((tokens[:, :1], tokens[:, 1:][:, torch.randperm(GRID * GRID)]), dim=1)
     with torch.no_grad():
         same = torch.allclose(module(tokens), module(shuffled), atol=1e-10)
-    assert same == (kind in ("netvlad", "cosplace", "salad"))  # BoQ's 3x3 projection and MixVPR's mixing look at it
+    assert same == (kind not in ("boq", "mixvpr"))  # BoQ's 3x3 projection and MixVPR's mixing look at it
 
 
 def test_transport_gives_each_patch_its_mass_and_in_time_each_cluster_its_own() -> None:
@@ -194,6 +209,7 @@ def test_transport_gives_each_patch_its_mass_and_in_time_each_cluster_its_own() 
         ("mixvpr", {}, 1024, 20, 2_337_604, 4096),  # with ResNet-50 up to layer 3 10.88 M, as published
         ("netvlad", {}, 1024, 20, 2 * 64 * 1024, 65_536),
         ("cosplace", {}, 2048, 10, 1 + 2048 * 512 + 512, 512),
+        ("transvpr", {}, 768, 30, 768 * 256 + 256 + 3 * 769, 256),
         ("boq", {}, 768, 16, None, 12_288),
         ("boq", {"boq": BoQConfig(channels=512)}, 1024, 20, None, 16_384),
     ],
@@ -253,13 +269,17 @@ def test_each_baseline_trains_all_it_says(name: str, small: ModelConfig) -> None
     config = variant(name, small)
     parts = SMALL_PARTS | {"boq": BoQConfig(channels=64, queries=4)}
     resnet = dataclasses.replace(config.backbone.resnet, stages=(1, 1, 1, 1), width=4)
+    names = {"resnet50": "resnet_custom", "transvpr": "transvpr"}
     backbone = dataclasses.replace(
-        config.backbone, name="resnet_custom" if config.backbone.name == "resnet50" else "custom", resnet=resnet
+        config.backbone,
+        name=names.get(config.backbone.name, "custom"),  # type: ignore[arg-type]
+        resnet=resnet,
+        transvpr=TransVPRConfig(dim=16, width=4),
     )
     last = min(config.last_blocks, 2)
     pooling = dataclasses.replace(config.pooling, **parts)
     config = dataclasses.replace(config, backbone=backbone, pooling=pooling, last_blocks=last)
-    size = 84 if "resnet" in backbone.name else 42
+    size = {"resnet_custom": 84, "transvpr": 48}.get(backbone.name, 42)
     torch.manual_seed(0)
     model = build_model(config, size)
     descriptors = model(torch.randn(4, 3, size, size))

@@ -8,6 +8,7 @@ import torch
 
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.search.rerank.grid_patches import GridPatches
+from pipeline.evaluation.search.rerank.key_patches import KeyPatches
 from pipeline.evaluation.search.rerank.patch_netvlad import PatchNetVLAD, PatchNetVLADRapid
 from pipeline.evaluation.search.rerank.reranker import Reranker
 
@@ -15,6 +16,7 @@ RERANKERS: dict[str, type[Reranker]] = {
     "patches": GridPatches,
     "patch-netvlad": PatchNetVLAD,
     "patch-netvlad-rss": PatchNetVLADRapid,
+    "transvpr": KeyPatches,
 }
 
 

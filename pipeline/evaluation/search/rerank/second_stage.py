@@ -33,7 +33,7 @@ class Cost:
     describing: float = 0.0
     """Seconds of these for reading photos and describing them."""
     photo_bytes: int = 0
-    """Features of one photo, all are of one size."""
+    """Features of one photo, the largest."""
 
 
 class Described:
@@ -55,7 +55,8 @@ class Described:
             self._kept[path] = stage.describe(normalise(image) if image.dtype == torch.uint8 else image)
             if stage.device.type == "cuda":
                 torch.cuda.synchronize(stage.device)  # or its time would count as matching
-            self.cost.photo_bytes = sum(part.numel() * part.element_size() for part in self._kept[path])
+            size = sum(part.numel() * part.element_size() for part in self._kept[path])
+            self.cost.photo_bytes = max(self.cost.photo_bytes, size)
             while len(self._kept) * self.cost.photo_bytes > KEPT_BYTES and len(self._kept) > 1:
                 self._kept.popitem(last=False)
             self.cost.describing += time.perf_counter() - begun

@@ -11,31 +11,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from releases_restated import filled, vgg, vgg_shapes, vlad_shapes
 from second_stages_restated import patch_order, patch_scores, patch_vlads
 from tiny_matchers import netvlad
+from tiny_scenes import turned, views
 
 from pipeline.common.errors import UsageError
 from pipeline.config import EvaluationConfig, PoolingConfig
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.search.rerank import build_reranker
 from pipeline.evaluation.search.rerank.matches import homography_inliers, rapid_score
-from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.released import from_release
 
 CLUSTERS, DIM, SIDE = 3, 24, 12
 METHODS = ("patch-netvlad", "patch-netvlad-rss")
-
-
-def views(place: int, count: int) -> torch.Tensor:
-    """[count, 3, S, S]: one scene, each view moved by a token to the right and half a token down, with noise."""
-    generator = torch.Generator().manual_seed(place)
-    scene = torch.randn(1, 3, 16, 16, generator=generator).repeat_interleave(16, 2).repeat_interleave(16, 3)
-    side = 16 * SIDE
-    cut = torch.cat([scene[..., 8 * i : 8 * i + side, 16 * i : 16 * i + side] for i in range(count)])
-    return cut + 0.1 * torch.randn(cut.shape, generator=generator)
 
 
 class Colours(torch.nn.Module):
@@ -61,7 +51,7 @@ def released() -> tuple[dict[str, torch.Tensor], PlaceModel]:
 def test_patches_are_the_restated_ones(released: tuple[dict[str, torch.Tensor], PlaceModel]) -> None:
     """Through both networks; the sums over patches in float64."""
     state, model = released
-    image = views(0, 1)[..., :144, :144]
+    image = views(0, 1, SIDE)[..., :144, :144]
     with torch.no_grad():
         theirs = vgg(state, "encoder.", image, 28)
         tokens = model.backbone(image)
@@ -79,7 +69,7 @@ def test_the_same_patches_get_the_restated_scores_and_order(
 ) -> None:
     model = copy.deepcopy(released[1])
     model.backbone = Colours()
-    images = torch.cat((views(0, 3), views(1, 1)))
+    images = torch.cat((views(0, 3, SIDE), views(1, 1, SIDE)))
     with torch.no_grad():  # whitening takes the mean off
         whitening, model.pooling.projection = model.pooling.projection, None
         vlad = torch.cat(model.pooling.of_patches(model.backbone(images), (SIDE, SIDE), (2, 5, 8)), 1)
@@ -121,26 +111,11 @@ def test_a_size_that_scores_all_candidates_alike_tells_nothing() -> None:
     np.testing.assert_allclose(stage.combine(np.array([[3.0, 7, 1], [1, 7, 2]])), [0.45 - 0.4, 0.4 - 0.45])
 
 
-@pytest.fixture
-def turned(tmp_path: Path) -> EvaluationSet:
-    """Two places; of each the database holds a moved view, behind its mirror image, which is as like in its colours."""
-    database, queries, positives = [], [], []
-    for place in range(2):
-        scene = np.random.default_rng(place).integers(0, 256, (14, 14, 3)).repeat(8, 0).repeat(8, 1).astype(np.uint8)
-        query, moved = scene[:96, :96], scene[8:104, 8:104]
-        for pixels, name, kept in (
-            (query, f"q{place}", queries), (moved[:, ::-1], f"{place}-a", database), (moved, f"{place}-b", database)
-        ):  # fmt: skip
-            kept.append(tmp_path / f"{name}.png")
-            Image.fromarray(pixels).save(kept[-1])
-        positives.append(np.array([2 * place + 1]))
-    return EvaluationSet("turned", database, queries, positives, "pairs")
-
-
 @pytest.mark.parametrize("method", METHODS)
-def test_an_evaluation_puts_the_moved_view_first_and_says_how(turned: EvaluationSet, method: str) -> None:
+def test_an_evaluation_puts_the_moved_view_first_and_says_how(tmp_path: Path, method: str) -> None:
+    scenes = turned(tmp_path)
     ask = partial(EvaluationConfig, groups=("single",), recalls=(1,), workers=0, rerank=4)
-    (result,) = evaluate(netvlad(), [turned], ask(rerank_by=method), "cpu", progress=False)
+    (result,) = evaluate(netvlad(), [scenes], ask(rerank_by=method), "cpu", progress=False)
     assert result.recalls[1] == 100
     assert result.protocol.name == f"single_96px_pairs_rerank4-{method}"
     assert "first 4 re-ranked by Patch-NetVLAD" in result.protocol.describe()
@@ -149,8 +124,9 @@ def test_an_evaluation_puts_the_moved_view_first_and_says_how(turned: Evaluation
 
 
 def test_what_cannot_be_matched_is_refused_before_anything_is_described(
-    turned: EvaluationSet, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    scenes = turned(tmp_path)
     config = EvaluationConfig(groups=("single",), recalls=(1,), workers=0, rerank=2, rerank_by="patch-netvlad")
     gem = build_model(dataclasses.replace(netvlad().config, pooling=PoolingConfig(kind="gem")), 96).eval()
     for model, asked, told in (
@@ -159,8 +135,8 @@ def test_what_cannot_be_matched_is_refused_before_anything_is_described(
         (netvlad(), dataclasses.replace(config, rerank_layer=1), "leave rerank_layer out"),
     ):
         with pytest.raises(UsageError, match=told):
-            evaluate(model, [turned], asked, "cpu", progress=False)
+            evaluate(model, [scenes], asked, "cpu", progress=False)
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(UsageError, match=r"needs OpenCV: pip install .*\[rerank\]"):
-        evaluate(netvlad(), [turned], config, "cpu", progress=False)
-    evaluate(netvlad(), [turned], dataclasses.replace(config, rerank_by="patch-netvlad-rss"), "cpu", progress=False)
+        evaluate(netvlad(), [scenes], config, "cpu", progress=False)
+    evaluate(netvlad(), [scenes], dataclasses.replace(config, rerank_by="patch-netvlad-rss"), "cpu", progress=False)

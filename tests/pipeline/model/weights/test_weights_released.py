@@ -27,6 +27,8 @@ from releases_restated import (
     resnet_shapes,
     salad,
     salad_shapes,
+    transvpr,
+    transvpr_shapes,
     vgg,
     vgg_shapes,
     vlad,
@@ -160,6 +162,7 @@ CASES: dict[str, tuple[str, int, Shape, Callable[[State, Tensor], Tensor]]] = {
         "boq", 70, small("backbone.net.", (1, 1, 2)) | boq_shapes(128, 64, 5, 2, 3),
         lambda s, x: boq(s, resnet(s, sequence("backbone.net."), x)),
     ),
+    "TransVPR": ("transvpr", 64, transvpr_shapes(128, 6, 8), transvpr),
     "BoQ ResNet, frozen and trained": (
         "boq", 70, resnet_shapes(boq_frozen(), (1, 1, 2), width=8) | boq_shapes(128, 64, 5, 2, 3),
         lambda s, x: boq(s, resnet(s, boq_frozen(), x)),
@@ -218,7 +221,9 @@ def test_wrappers_prefixes_and_half_precision_are_taken_off(tmp_path: Path) -> N
         assert torch.allclose(from_release(bare, "a", None, size)(images), wanted, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["CosPlace VGG-16", "SFRS with PCA", "BoQ DINOv2", "GCL, average", "MixVPR"])
+@pytest.mark.parametrize(
+    "name", ["CosPlace VGG-16", "SFRS with PCA", "BoQ DINOv2", "GCL, average", "MixVPR", "TransVPR"]
+)
 def test_one_file_of_ours_holds_it_all(name: str, tmp_path: Path) -> None:
     kind, size, shapes, _ = CASES[name]
     model = from_release(filled(shapes), "a.pth", kind, size)
