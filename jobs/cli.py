@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn, TypeVar
 
-from pipeline.common.errors import UsageError, UserError
+from pipeline.common.errors import UsageError, UserError, tell_launcher
 from pipeline.common.text import shown
 from pipeline.config import RunConfig, from_dict, nested
 from pipeline.config.setting import alternatives, did_you_mean, present_name
@@ -111,12 +111,18 @@ def parse_part(parts: Mapping[str, type], description: str, argv: Sequence[str] 
 
 
 def run_job(main: Callable[[], Any]) -> NoReturn:
-    """Runs a job's main; turns a `UserError` into one line on stderr and its exit code."""
+    """Runs a job's main; turns a `UserError` into one line on stderr and its exit code.
+
+    Of the processes of a machine the first tells it; a launcher shows it once more, after its own traceback.
+    """
     try:
         main()
         code = 0
     except UserError as error:
-        print(f"{program_name()}: {error}", file=sys.stderr)
+        line = f"{program_name()}: {error}"
+        if os.environ.get("LOCAL_RANK", "0") == "0":
+            print(line, file=sys.stderr)
+        tell_launcher(line)
         code = error.exit_code
     except KeyboardInterrupt:
         print(f"{program_name()}: interrupted", file=sys.stderr)

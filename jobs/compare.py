@@ -50,9 +50,10 @@ def main() -> None:
         return
     from pipeline.evaluation.report.figures import also_as
     from pipeline.training.records import comparison
-    from pipeline.training.records.tracking import store_uri
+    from pipeline.training.records.tracking import how_to_open, store_uri
 
-    runs = comparison.load_runs(store_uri(job.uri, job.output), job.experiment, job.runs)
+    uri = store_uri(job.uri, job.output)
+    runs = comparison.load_runs(uri, job.experiment, job.runs)
     table = comparison.table(runs)
     table.print()
     folder = Path(job.output) / "comparison"
@@ -78,6 +79,7 @@ def main() -> None:
     if drawn:
         written.append(folder / "recall_curves.png")
     print("\nwritten: " + "  ".join(str(path) for path in written))
+    print("in MLflow: " + how_to_open(uri, runs[0].experiment, *(run.run_id for run in runs)))
 
 
 def compare_evaluations(job: CompareJob) -> None:

@@ -13,7 +13,9 @@ from typing import NoReturn
 
 from jobs.cli import run_job
 
-JOBS = sorted({path.stem for path in Path(__file__).parent.glob("*.py")} - {"__init__", "cli", "console", "there"})
+JOBS = sorted(
+    {path.stem for path in Path(__file__).parent.glob("*.py")} - {"__init__", "cli", "console", "processes", "there"}
+)
 
 
 def __getattr__(name: str) -> Callable[[], NoReturn]:

@@ -96,14 +96,13 @@ def main() -> None:
     step("Draw a city", python, "-m", "jobs.miniature", "--out", str(city), "--places", str(job.places))
     step("Write its photos into shards", python, "-m", "jobs.prepare", "--source", str(city / "gsv"),
          "--out", str(shards), "--rounds", "2")  # fmt: skip
-    launcher = [str(Path(python).with_name("accelerate")), "launch", "--config_file", "jobs/accelerate/cpu.yaml",
-                "--num_processes", str(job.processes)]  # fmt: skip
+    together = ["--processes", str(job.processes), *(["--launcher", "cpu"] if job.processes > 1 else [])]
     epochs = ["--train.epochs", str(job.epochs)] if job.epochs else []
     for row in ROWS:
-        step(f"Train '{row.run}': {row.what}", *launcher, "-m", "jobs.train", "--config", CONFIG, "--name", row.run,
-             "--output", str(out), "--data.shards", str(shards), "--validate.sets", test_set,
+        step(f"Train '{row.run}': {row.what}", python, "-m", "jobs.train", "--config", CONFIG, "--name", row.run,
+             *together, "--output", str(out), "--data.shards", str(shards), "--validate.sets", test_set,
              *row.settings, *epochs)  # fmt: skip
-        step(f"Evaluate '{row.run}' on places it has never seen", *launcher, "-m", "jobs.evaluate",
+        step(f"Evaluate '{row.run}' on places it has never seen", python, "-m", "jobs.evaluate", *together,
              "--checkpoint", str(out / row.run), "--sets", test_set, "--groups", ",".join(row.groups))  # fmt: skip
     step("Compare them", python, "-m", "jobs.compare", "--output", str(out), "--runs", ",".join(r.run for r in ROWS))
     pictures(out, test_set)

@@ -1,7 +1,7 @@
 """Recall of a checkpoint, with its protocol: on the given sets or all that are found, in three groupings.
 
     python -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k,msls_val --root data
-    accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k
+    python -m jobs.evaluate --checkpoint outputs/RUN --sets pitts30k --processes 4
     python -m jobs.evaluate --from_store outputs/RUN/evaluation --dimensions 512 --searches int8,binary --refine 100
 
 Prints one table and writes results.json, results.md, results.csv, predictions/, figures/ and report.html. The number of
@@ -22,14 +22,15 @@ from pathlib import Path
 from typing import Literal
 
 from jobs.cli import parse, run_job
+from jobs.processes import Processes, check_processes, spread
 from jobs.there import need_model, need_sets
 from pipeline.common.errors import UsageError
 from pipeline.common.files import check_writable
-from pipeline.config import EvaluationConfig, SearchKind, to_dict
+from pipeline.config import EvaluationConfig, SearchKind, recorded, to_dict
 
 
 @dataclass(frozen=True)
-class EvaluateJob(EvaluationConfig):
+class EvaluateJob(EvaluationConfig, Processes):
     """Evaluate a checkpoint. Without `sets`, every set found under `root`."""
 
     checkpoint: str = ""
@@ -61,6 +62,7 @@ OPEN = ("sets", "root", "split", "recalls", "radius", "frames", "without_positiv
 def main() -> None:
     """Parses, evaluates, reports."""
     job = parse(EvaluateJob, __doc__ or "")
+    check_processes(job)
     config = EvaluationConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(EvaluationConfig)})
     if job.from_store is not None:
         stored(job, Path(job.from_store), config)
@@ -73,6 +75,7 @@ def main() -> None:
     need_model(job.checkpoint)
     if len(config.sets) == 1:  # of several, those that are not there are left out
         need_sets(config)
+    spread(job, "jobs.evaluate")
     from pipeline.training.launch import launched
 
     with launched(job.timeout) as accelerator:
@@ -110,7 +113,7 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
         return
     tables.show(results)
     about = {"checkpoint": str(file), "fingerprint": fingerprint, "descriptor_dim": model.descriptor_dim}
-    plain = {**about, "model": to_dict(model.config), "evaluation": to_dict(config), "left_out": left_out}
+    plain = {**about, "model": to_dict(model.config), "evaluation": recorded(config), "left_out": left_out}
     save_results(results, sets, output, plain)
     if job.figures:
         with also_as(job.figures_also):
@@ -147,7 +150,7 @@ def stored(job: EvaluateJob, folder: Path, config: EvaluationConfig) -> None:
         print(f"left out: {line}", file=sys.stderr)
     results = evaluate_stores(folder, sets, config, job.dimensions, job.prefixes, job.searches)
     tables.show(results)
-    save_results(results, sets, output, {"stores": str(folder), "evaluation": to_dict(config), "left_out": left_out})
+    save_results(results, sets, output, {"stores": str(folder), "evaluation": recorded(config), "left_out": left_out})
     print(f"\nwritten to {output}/")
 
 

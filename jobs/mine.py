@@ -1,7 +1,7 @@
 """Describe the places of shards with a trained model, for training in mined order (`data.order: mined`).
 
     python -m jobs.mine --checkpoint outputs/RUN --shards data/shards --out data/mined.safetensors
-    accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.mine --checkpoint outputs/RUN --out FILE
+    python -m jobs.mine --checkpoint outputs/RUN --out FILE --processes 4
     python -m jobs.train --config FILE --data.order mined --data.mine_from data/mined.safetensors
 
 A training that mines by itself (`data.mine_from: single`) needs no such file. The number of processes changes nothing
@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Literal
 
 from jobs.cli import parse, run_job
+from jobs.processes import Processes, check_processes, spread
 from jobs.there import need_model, need_shards
 from pipeline.common.errors import UsageError
 from pipeline.config import DataConfig
 
 
 @dataclass(frozen=True)
-class MineJob:
+class MineJob(Processes):
     """Write one short descriptor a place, which mined batches are planned from."""
 
     checkpoint: str = ""
@@ -46,6 +47,7 @@ class MineJob:
 def main() -> None:
     """Parses, describes, writes."""
     job = parse(MineJob, __doc__ or "")
+    check_processes(job)
     for name in ("checkpoint", "out"):
         if not getattr(job, name):
             raise UsageError(f"--{name} is missing")
@@ -54,6 +56,7 @@ def main() -> None:
     data = DataConfig(shards=job.shards, workers=job.workers, cache=job.cache)
     need_model(job.checkpoint)
     need_shards(job.shards)
+    spread(job, "jobs.mine")
     from pipeline.training.launch import launched
 
     with launched(job.timeout) as accelerator:

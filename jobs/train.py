@@ -1,9 +1,12 @@
-"""Train one run, or continue it: accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.train --config FILE
+"""Train one run, or continue it.
 
-Also runs without the launcher, in one process: `python -m jobs.train --config FILE --data.places_per_batch 16`.
+    python -m jobs.train --config FILE --processes 4
+    python -m jobs.train --config FILE --data.places_per_batch 16
+
 The same command continues a run that was killed. `--dry_run` prints the plan and exits; `--fast_dev_run` tries
 everything in two small steps. Exit codes: 0 done, 2 usage or configuration, 3 data, 4 diverged, 75 preempted and saved,
-130 interrupted. `accelerate launch` turns every code but 0 into 1; `<run>/status.json` has the true one.
+130 interrupted. torchrun, slurm and `accelerate launch` start it as well; `accelerate launch` and torchrun turn every
+code but 0 into 1, and `<run>/status.json` has the true one.
 """
 
 from __future__ import annotations
@@ -11,14 +14,16 @@ from __future__ import annotations
 import dataclasses
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 from jobs.cli import parse, run_job
+from jobs.processes import Processes, check_processes, spread
 from jobs.there import need_sets, need_shards, need_weights
 from pipeline.config import RunConfig, changed
 
 
 @dataclass(frozen=True)
-class TrainJob(RunConfig):
+class TrainJob(RunConfig, Processes):
     """Train place recognition on the global batch. Every setting is a YAML key and an option."""
 
     dry_run: bool = False
@@ -30,11 +35,13 @@ class TrainJob(RunConfig):
 def main() -> None:
     """Parses, trains, says how it ended."""
     job = parse(TrainJob, __doc__ or "")
+    check_processes(job)
     config = RunConfig(**{f.name: getattr(job, f.name) for f in dataclasses.fields(RunConfig)})
     need_shards(config.data.shards)
     need_sets(config.validate)
     if not job.dry_run:  # which needs no weights
         need_weights(config.model)
+    spread(job, "jobs.train", lambda: recorded_code(job))
     from pipeline.training.launch import launched
 
     with launched(config.train.timeout) as accelerator:
@@ -58,10 +65,22 @@ def main() -> None:
         outcome = try_out(config, accelerator) if job.fast_dev_run else train(config, accelerator)
         if first:
             from pipeline.training.records.run_log import FEWEST, draw
+            from pipeline.training.records.tracking import record_curves
 
             picture = draw(outcome.run, STEPS if job.fast_dev_run else FEWEST)
+            if picture is not None:
+                record_curves(outcome.run, picture)
             print(f"{outcome.run}: {outcome}", flush=True)
             print(f"see {outcome.run / 'train.log'}" + (f" and {picture}" if picture else ""), flush=True)
+
+
+def recorded_code(job: TrainJob) -> int | None:
+    """The exit code in the run's `status.json`."""
+    from pipeline.training.records.run_folder import read_status
+    from pipeline.training.trial import SUFFIX
+
+    code = read_status(Path(job.output) / (job.name + SUFFIX * job.fast_dev_run)).get("exit_code")
+    return code if isinstance(code, int) else None
 
 
 if __name__ == "__main__":

@@ -230,7 +230,7 @@ def lost(error: BaseException) -> Unexpected | None:
     network = isinstance(error, (dist.DistBackendError, dist.DistNetworkError, dist.DistStoreError))
     if not is_distributed() or not isinstance(error, RuntimeError) or not (network or "gloo/transport" in text):
         return None
-    reason = text.strip().splitlines()[0].split("] ")[-1]
+    reason = text.strip().splitlines()[0].split("] ")[-1].split(". This is typically")[0]  # gloo adds a guess
     return Unexpected(f"rank {rank()}: another rank ended or did not answer ({reason}); its own messages say why")
 
 

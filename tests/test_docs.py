@@ -83,6 +83,8 @@ SLOW = (
     "python -m jobs.benchmark ranks", "python -m jobs.benchmark engines", "python -m jobs.benchmark search --pca",
     "python -m jobs.benchmark store", "python -m jobs.benchmark step --size vitb",
     "accelerate launch --config_file jobs/accelerate/ddp.yaml -m jobs.train",
+    "python -m jobs.train --config jobs/configs/mixvpr.yaml",
+    "python -m jobs.train --config jobs/configs/cricavpr.yaml --train.passes joint",
     "python -m jobs.evaluate --checkpoint outputs/cricavpr --groups single,bank",
     "python -m jobs.experiment --table one_photo",
     "OMP_NUM_THREADS=1 python -m jobs.experiment",

@@ -6,6 +6,12 @@ file, what to do - because the jobs print it as one line, without a traceback (`
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
+import time
+from pathlib import Path
+
 from pipeline.common.text import message
 
 
@@ -53,6 +59,19 @@ class Unexpected(UserError):
     """Another rank met an error that no user can mend; its traceback stands with that rank's messages (exit code 1)."""
 
     exit_code = 1
+
+
+def tell_launcher(line: str) -> None:
+    """Leaves the error for torch's launcher (torchrun, accelerate), which ends with a summary of the failed ranks.
+
+    The file and its form are those of `torch.distributed.elastic.multiprocessing.errors`; without a launcher, nothing.
+    """
+    file = os.environ.get("TORCHELASTIC_ERROR_FILE")
+    if not file:
+        return
+    told = {"message": {"message": line, "extraInfo": {"timestamp": str(int(time.time()))}}}
+    with contextlib.suppress(OSError):  # the line stands on stderr in any case
+        Path(file).write_text(json.dumps(told))
 
 
 _LIBRARIES = (

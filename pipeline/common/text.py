@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 # what markdown reads as markup; an underscore inside a word is not
 MARKUP = re.compile(r"[\\`*<>|\[\]~&]|(?<!\w)_|_(?!\w)")
+PASSWORD = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*://)[^/\s?#'\"]*:[^/\s?#'\"]*@")  # of a URL
 LIMIT = 200  # characters shown of a name or value in a message
 LONG = re.compile(r"(\S{500})\S+(\S{500})")  # in a whole message
 FORMULA = ("=", "+", "-", "@")
@@ -42,9 +43,15 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
 
 
+def without_passwords(text: str) -> str:
+    """The text with the `user:password@` of each URL left out, for whatever is printed or recorded."""
+    return PASSWORD.sub(r"\1", text)
+
+
 def message(text: str) -> str:
-    """A whole message as one printable line; a name of more than 1000 characters without a space loses its middle."""
-    return LONG.sub(r"\1...\2", printable(text))
+    """A whole message as one printable line; a name of more than 1000 characters without a space loses its middle, and a
+    URL its password."""
+    return LONG.sub(r"\1...\2", printable(without_passwords(text)))
 
 
 def markdown_text(text: str) -> str:

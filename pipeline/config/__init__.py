@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.common.errors import UsageError
+from pipeline.common.text import without_passwords
 from pipeline.config.model import AdapterConfig as AdapterConfig
 from pipeline.config.model import BackboneConfig as BackboneConfig
 from pipeline.config.model import CrossImageConfig as CrossImageConfig
@@ -242,6 +243,8 @@ class TrackingConfig(Settings):
     """Tracking server or store; none: MLFLOW_TRACKING_URI, else sqlite in `<output>/mlflow.db`."""
     experiment: str = setting("place-recognition", changes="none")
     """Experiment name."""
+    register: str | None = setting(None, changes="none", file_name=True)
+    """Name in MLflow's model registry: when the run is done, its best checkpoint, whole, becomes a new version there."""
     enabled: bool = setting(True, changes="none")
     """False records nothing."""
 
@@ -291,8 +294,22 @@ def to_dict(config: Any) -> dict[str, Any]:
     return plain
 
 
+def recorded(config: Any) -> dict[str, Any]:
+    """`to_dict` for what others may read: without the passwords of URLs."""
+
+    def clean(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: clean(inner) for key, inner in value.items()}
+        if isinstance(value, list):
+            return [clean(inner) for inner in value]
+        return without_passwords(value) if isinstance(value, str) else value
+
+    cleaned: dict[str, Any] = clean(to_dict(config))
+    return cleaned
+
+
 def flatten(config: Any) -> dict[str, Any]:
-    """The config as one level with dotted keys, `data.places_per_batch`, as logged to MLflow."""
+    """`recorded` as one level with dotted keys, `data.places_per_batch`."""
     flat: dict[str, Any] = {}
 
     def walk(prefix: str, value: Any) -> None:
@@ -302,7 +319,7 @@ def flatten(config: Any) -> dict[str, Any]:
         else:
             flat[prefix] = value
 
-    walk("", to_dict(config))
+    walk("", recorded(config))
     return flat
 
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import EvaluationConfig, from_dict, to_dict
+from pipeline.config import EvaluationConfig, from_dict, recorded, to_dict
 from pipeline.evaluation.evaluate import Result, evaluate, projections_from
 from pipeline.evaluation.identity import model_digest
 from pipeline.evaluation.predictions import save_predictions
@@ -75,7 +75,7 @@ def _keep(run: Path, path: Path, file: Path, config: EvaluationConfig, results: 
     from pipeline.training.records.tracking import record_evaluation
 
     temporary = path.with_suffix(".part")
-    tables.write_json(results, temporary, {"checkpoint": str(file), "evaluation": to_dict(config)})
+    tables.write_json(results, temporary, {"checkpoint": str(file), "evaluation": recorded(config)})
     values = {name: value for entry in tables.as_dicts(results) for name, value in entry["metrics"].items()}
     record_evaluation(run, read_metadata(file)["extra"], values, path.parent)
     temporary.replace(path)

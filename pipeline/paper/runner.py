@@ -21,11 +21,12 @@ from types import FrameType
 from typing import Any
 
 from pipeline.common.errors import Diverged, Preempted, UserError
-from pipeline.config import to_dict
+from pipeline.config import recorded
 from pipeline.evaluation.protocol import Protocol, read_protocol
 from pipeline.evaluation.report import tables
 from pipeline.paper.measure import results_file, write_order
 from pipeline.paper.plan import Cell, Training
+from pipeline.training.records.tracking import store_uri
 
 Recalls = dict[tuple[str, Protocol], dict[int, float]]
 """(set, protocol) -> N -> Recall@N in percent."""
@@ -81,8 +82,9 @@ class Runner:
         run.mkdir(parents=True, exist_ok=True)
         import yaml
 
+        store_uri(training.config.tracking.uri, str(self.output))  # a password goes on by the environment
         settings = run / "training.yaml"
-        settings.write_text(yaml.safe_dump(to_dict(training.config), sort_keys=False))
+        settings.write_text(yaml.safe_dump(recorded(training.config), sort_keys=False))
         (run / "status.json").unlink(missing_ok=True)  # of an earlier attempt
         code = self._start("jobs.train", "--config", str(settings))
         if code == 0:

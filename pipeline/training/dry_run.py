@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from pipeline.common.text import Table
+from pipeline.common.text import Table, without_passwords
 from pipeline.config import RunConfig
 from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
@@ -122,4 +122,4 @@ def _gb(n: float) -> str:
 
 def show(rows: list[tuple[str, str]]) -> str:
     """The rows as an aligned text table."""
-    return Table((), [(f"  {name}", value) for name, value in rows], (0, 1)).text()
+    return Table((), [(f"  {name}", without_passwords(value)) for name, value in rows], (0, 1)).text()

@@ -23,10 +23,10 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from pipeline.common.errors import Interrupted, Preempted, UsageError, UserError
+from pipeline.common.errors import Interrupted, Preempted, UsageError, UserError, tell_launcher
 from pipeline.distributed import is_distributed, lost, open_statistics_group
 
-ADVICE = "launch with: accelerate launch --config_file jobs/accelerate/<engine>.yaml -m jobs.train --config FILE"
+ADVICE = "start it with --processes N, or: accelerate launch --config_file jobs/accelerate/<engine>.yaml -m jobs.train"
 
 
 ENDING = 15  # seconds that the end of a failed job may take
@@ -152,8 +152,10 @@ def launched(timeout: float) -> Iterator[Any]:
             signal.alarm(ENDING)
         if (gone := lost(error)) is not None:
             print(gone, file=sys.stderr, flush=True)
+            tell_launcher(str(gone))
             sys.exit(gone.exit_code)
         if isinstance(error, UserError) and not accelerator.is_main_process:
+            tell_launcher(str(error))
             sys.exit(error.exit_code)
         raise
     finally:

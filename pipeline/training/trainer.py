@@ -27,7 +27,7 @@ from torch import Tensor
 
 from pipeline.common.errors import DataError, Diverged, Interrupted, Preempted, UsageError
 from pipeline.common.files import write_atomically
-from pipeline.config import RunConfig, flatten, to_dict
+from pipeline.config import RunConfig, flatten, recorded
 from pipeline.data.cliques import Mined
 from pipeline.data.images import normalise
 from pipeline.data.places import Batch, build_loader
@@ -40,7 +40,8 @@ from pipeline.evaluation.search.projection import check_prefix
 from pipeline.model.bank import Bank, bank_beside, save_bank
 from pipeline.model.cross_image import check_crossing
 from pipeline.model.vpr import PlaceModel, build_model
-from pipeline.model.weights.files import frozen_hash, load_trainable, save_model, saved_names
+from pipeline.model.weights.convert import write_model
+from pipeline.model.weights.files import frozen_hash, load_model, load_trainable, save_model, saved_names
 from pipeline.training import checkpoint
 from pipeline.training.checkpoint import RunState
 from pipeline.training.compiled import compile_backbone, uncompiled
@@ -196,6 +197,7 @@ class Trainer:
                     self._validate()
                 while not self._ended():
                     self._epoch()
+                on_rank_0(partial(self.tracker.finished, self._write_whole), what="recording the end of the run")
                 status = "FINISHED"
                 return Outcome(self.run, self.state, self._ended())
             except (Preempted, Interrupted, KeyboardInterrupt):
@@ -426,6 +428,11 @@ class Trainer:
                 tensors[name].copy_(value)
         return state, broadcast_tensors(moments), origin
 
+    def _write_whole(self, folder: Path) -> None:
+        """The best checkpoint's model, complete, as `folder`/model.safetensors."""
+        best = self.run / "checkpoints" / "best"
+        write_model(load_model(best), folder / "model.safetensors", str(self.run))
+
     def _open(self) -> None:
         """The run's folder, its MLflow run and the sample log."""
         config = self.config
@@ -435,7 +442,7 @@ class Trainer:
             self.run.mkdir(parents=True, exist_ok=True)
             for log in self.run.glob("samples.rank*.jsonl"):  # also those of a former, larger number of ranks
                 self._forget_samples(log)
-            write_atomically(self.run / "config.json", (json.dumps(to_dict(config), indent=1) + "\n").encode())
+            write_atomically(self.run / "config.json", (json.dumps(recorded(config), indent=1) + "\n").encode())
             # a run killed before its first checkpoint left its id here
             known = self.state.run_id or (note.read_text().strip() if note.exists() else "")
             self.tracker = Tracker(config, known, config.tracking.enabled)
@@ -534,7 +541,8 @@ def mined_metrics(mined: tuple[float, ...]) -> dict[str, float]:
 
 
 def check_batch(config: RunConfig, steps_per_epoch: int) -> None:
-    """Refuses a global batch that cannot be cut equally or never fills, and passes that the model cannot give.
+    """Refuses a global batch that cannot be cut equally or never fills, and passes that the model cannot give, and a
+    registration without a record.
 
     Raises:
         UsageError: with the numbers.
@@ -542,6 +550,8 @@ def check_batch(config: RunConfig, steps_per_epoch: int) -> None:
     places, w = config.data.places_per_batch, world_size()
     if config.train.passes == "joint":
         check_crossing(config.model.cross_image, "train.passes joint")
+    if config.tracking.register is not None and not config.tracking.enabled:
+        raise UsageError("tracking.register: a model is registered in MLflow, but tracking.enabled is false")
     if config.validate.sets and "bank" in config.validate.groups:
         check_crossing(config.model.cross_image, "validate.groups bank")
     if places % w:

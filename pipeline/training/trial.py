@@ -33,6 +33,7 @@ def small(config: RunConfig, processes: int) -> RunConfig:
         train=replace(
             config.train, epochs=1, steps=STEPS, log_every=1, save_every=1, validate_first=False, resume="never"
         ),
+        tracking=replace(config.tracking, register=None),
         validate=replace(config.validate, bank=min(config.validate.bank, QUERIES)),
     )
 

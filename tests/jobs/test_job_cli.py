@@ -20,7 +20,9 @@ from pipeline.config import EvaluationConfig, RunConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 JOBS = sorted(
-    path.stem for path in (ROOT / "jobs").glob("*.py") if path.stem not in ("__init__", "cli", "console", "there")
+    path.stem
+    for path in (ROOT / "jobs").glob("*.py")
+    if path.stem not in ("__init__", "cli", "console", "processes", "there")
 )
 
 

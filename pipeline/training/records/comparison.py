@@ -30,6 +30,7 @@ class Run:
     Attributes:
         name: as given by the user; made unique by the MLflow id where several share it.
         run_id: MLflow's.
+        experiment: MLflow's id of it.
         status: MLflow's ("FINISHED", "RUNNING", "KILLED", "FAILED").
         params: flat settings as text.
         metrics: newest value by metric name.
@@ -38,6 +39,7 @@ class Run:
 
     name: str
     run_id: str
+    experiment: str
     status: str
     params: dict[str, str]
     metrics: dict[str, float]
@@ -89,7 +91,17 @@ def load_runs(uri: str, experiment: str, wanted: Sequence[str] = ()) -> list[Run
             for key in metrics
             if key.startswith("validation/")
         }
-        runs.append(Run(name, entry.info.run_id, entry.info.status, dict(entry.data.params), metrics, history))
+        runs.append(
+            Run(
+                name,
+                entry.info.run_id,
+                found.experiment_id,
+                entry.info.status,
+                dict(entry.data.params),
+                metrics,
+                history,
+            )
+        )
     return runs
 
 

@@ -48,6 +48,8 @@ def test_the_way_to_the_records_has_no_password_and_starts_no_helpers() -> None:
     local = how_to_open("sqlite:///outputs/mlflow.db", "3", "abc")
     assert local.startswith("MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false mlflow ui --workers 1 ")
     assert local.endswith("http://localhost:5000/#/experiments/3/runs/abc")
+    beside = how_to_open("http://here:5000", "3", "abc", "def")
+    assert beside == "http://here:5000/#/compare-runs?runs=%5B%22abc%22%2C%20%22def%22%5D&experiments=%5B%223%22%5D"
     link = how_to_open("https://me:secret@records.example:8080/ml/", "3", "abc")
     assert link == "https://records.example:8080/ml/#/experiments/3/runs/abc"
     assert len(code_commit().removesuffix("-dirty")) in (0, 40)
