@@ -71,7 +71,19 @@ def main() -> None:
             if picture is not None:
                 record_curves(outcome.run, picture)
             print(f"{outcome.run}: {outcome}", flush=True)
-            print(f"see {outcome.run / 'train.log'}" + (f" and {picture}" if picture else ""), flush=True)
+            print(where_to_look(outcome.run, picture, outcome.page), flush=True)
+
+
+def where_to_look(run: Path, picture: Path | None, page: str) -> str:
+    """What a run has left, and the command that comes next."""
+    rows = {
+        "log": run / "train.log",
+        "curves": picture,
+        "model": run / "checkpoints" / "best",
+        "MLflow": page,
+        "next": f"python -m jobs.evaluate --checkpoint {run} --sets SETS",
+    }
+    return "\n".join(f"  {name:<7} {what}" for name, what in rows.items() if what)
 
 
 def recorded_code(job: TrainJob) -> int | None:

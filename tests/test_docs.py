@@ -43,10 +43,14 @@ ELSEWHERE = {
     "python -m jobs.evaluate --checkpoint CricaVPR.pth": "it needs the authors' file",
     "python -m jobs.locate --checkpoint outputs/cricavpr --index outputs/my_index --serve":
         "tests/jobs/test_job_locate.py",
-    "python -m jobs.weights": "tests/jobs/test_job_weights_figures.py",
-    "python -m jobs.figures": "tests/jobs/test_job_weights_figures.py",
     "python -m pytest tests/gpu": "it needs a GPU",
 }  # fmt: skip
+# a page's commands of a job that tests/jobs/test_job_weights_figures.py reads from the page and runs
+PAGES_ELSEWHERE = [
+    ("weights.md", ["jobs.weights"]),
+    ("figures.md", ["jobs.figures"]),
+    ("baselines.md", ["jobs.weights"]),
+]
 # what makes a command small, by the job (and part) it starts; later options win
 SMALL = {
     "jobs.prepare": "--out data/shown{number} --workers 1",
@@ -101,6 +105,8 @@ class Shown:
 
     @property
     def elsewhere(self) -> str | None:
+        if (self.page, self.text.split()[2:3]) in PAGES_ELSEWHERE:
+            return "tests/jobs/test_job_weights_figures.py"
         return next((where for start, where in ELSEWHERE.items() if self.text.startswith(start)), None)
 
     @property
@@ -123,11 +129,12 @@ class Shown:
 
 
 def shown(page: Path) -> list[Shown]:
-    """The commands of a page in their order: lines of shell blocks, and code spans."""
+    """The commands of a page in their order: lines of shell blocks, indented lines, and code spans."""
     text = page.read_text().replace("\\\n", " ")
     found = []
-    for block, span in re.findall(r"```(?:sh|bash|console)?\n(.*?)```|(?<!`)`([^`\n]+)`(?!`)", text, re.DOTALL):
-        for line in block.splitlines() or [span]:
+    blocks = r"(?m)```(?:sh|bash|console)?\n(.*?)```|^ {4}(?=\S)([^\n]+)|(?<!`)`([^`\n]+)`(?!`)"
+    for block, *line_or_span in re.findall(blocks, text, re.DOTALL):
+        for line in block.splitlines() or ["".join(line_or_span)]:
             command = re.sub(r"\s+", " ", re.split(r"\s+#|\s{2,}then ", line)[0]).strip().removeprefix("$ ")
             if PROGRAM.match(command + " ") and command != "accelerate launch":
                 found.append(Shown(page.name, command))
@@ -286,6 +293,9 @@ def test_every_shown_command_is_run_somewhere() -> None:
             assert command.words, command  # SMALL knows the job
         elif command.elsewhere.startswith("tests/"):
             assert (ROOT / command.elsewhere).exists(), command
+    for page, (job,) in PAGES_ELSEWHERE:  # the lines that the other file finds are all that the page shows
+        there = re.findall(rf"^ *python -m {re.escape(job)} ", (ROOT / "docs" / page).read_text(), re.MULTILINE)
+        assert len(there) == sum(f"python -m {job} " in command.text for command in ALL[page]) > 0, page
     texts = [c.text for c in COMMANDS]
     for start in (*ELSEWHERE, *SLOW):
         assert any(text.startswith(start) for text in texts), f"no page shows {start}"

@@ -244,7 +244,7 @@ class TrackingConfig(Settings):
     experiment: str = setting("place-recognition", changes="none")
     """Experiment name."""
     register: str | None = setting(None, changes="none", file_name=True)
-    """Name in MLflow's model registry: when the run is done, its best checkpoint, whole, becomes a new version there."""
+    """Name in MLflow's model registry: when the run is done, its best checkpoint, whole, is a new version there."""
     enabled: bool = setting(True, changes="none")
     """False records nothing."""
 

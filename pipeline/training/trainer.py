@@ -69,11 +69,13 @@ class Outcome:
         run: its folder.
         state: where it stands.
         reason: "epochs", "steps", "patience" or "already finished".
+        page: how a person sees its MLflow run; "" where this process did not record it.
     """
 
     run: Path
     state: RunState
     reason: str
+    page: str = ""
 
     def __str__(self) -> str:
         line = f"{self.reason}: step {self.state.step}, epoch {self.state.epoch}"
@@ -199,7 +201,7 @@ class Trainer:
                     self._epoch()
                 on_rank_0(partial(self.tracker.finished, self._write_whole), what="recording the end of the run")
                 status = "FINISHED"
-                return Outcome(self.run, self.state, self._ended())
+                return Outcome(self.run, self.state, self._ended(), self.tracker.where())
             except (Preempted, Interrupted, KeyboardInterrupt):
                 status = "KILLED"
                 raise

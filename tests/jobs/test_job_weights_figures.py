@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
-from releases_restated import SEQUENTIAL, filled, linear_shapes, resnet_shapes
+from releases_restated import BLOCKS, NAMED, SEQUENTIAL, filled, linear_shapes, resnet_shapes
+from safetensors.torch import save_file
 from tiny import make_evaluation, photo
 
 from jobs import figures, weights
@@ -38,7 +39,8 @@ SIZES = shlex.split(
 
 def commands(page: str, job: str) -> list[list[str]]:
     text = (ROOT / "docs" / page).read_text()
-    found = re.findall(rf"^python -m {re.escape(job)} (.*?)(?: +#.*)?$", text, re.MULTILINE)
+    text = text.replace("\\\n", " ")
+    found = re.findall(rf"^ *python -m {re.escape(job)} (.*?)(?: +#.*)?$", text, re.MULTILINE)
     return [shlex.split(line) for line in found]
 
 
@@ -99,6 +101,16 @@ def test_commands_of_the_weights_page(
     assert not target or (Path(target).is_file() and f"wrote {target}" in told)
     if target in {f"weights/{name}.safetensors" for name in ("cricavpr", "cosplace", "mine", "frozen")}:
         assert load_model(target).image_size == 56
+
+
+@pytest.mark.slow  # a whole ResNet-50
+@pytest.mark.parametrize("words", commands("baselines.md", "jobs.weights"), ids=lambda w: w[-1])
+def test_commands_of_the_baselines_page(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_file(filled(resnet_shapes(NAMED, BLOCKS["resnet50"])), "resnet50.safetensors")
+    start(weights, monkeypatch, *words)
+    model = load_model(words[-1])
+    assert model.image_size == 320 and model.config.backbone.resnet.layout == "keras"
 
 
 @pytest.mark.parametrize("words", commands("figures.md", "jobs.figures"), ids=lambda w: w[1])
