@@ -65,6 +65,7 @@ class Progress:
         """Ends the live line, or prints the closing plain line."""
         if self._bar is not None:
             self._show()
+            self._bar.live.transient = time.monotonic() - self._start < QUIET  # leaves nothing behind
             self._bar.stop()
             self._bar, Progress._live = None, None
         elif self.enabled and not failed and time.monotonic() - self._start >= QUIET:
