@@ -49,8 +49,8 @@ def without_passwords(text: str) -> str:
 
 
 def message(text: str) -> str:
-    """A whole message as one printable line; a name of more than 1000 characters without a space loses its middle, a URL
-    its password."""
+    """A whole message as one printable line. A name of more than 1000 characters without a space loses its middle, a
+    URL its password."""
     return LONG.sub(r"\1...\2", printable(without_passwords(text)))
 
 
