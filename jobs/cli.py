@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn, TypeVar
 
-from pipeline.common.errors import UsageError, UserError, tell_launcher
+from pipeline.common.errors import UsageError, tell_launcher, told
 from pipeline.common.text import shown
 from pipeline.config import RunConfig, from_dict, nested
 from pipeline.config.setting import alternatives, did_you_mean, present_name
@@ -111,25 +111,27 @@ def parse_part(parts: Mapping[str, type], description: str, argv: Sequence[str] 
 
 
 def run_job(main: Callable[[], Any]) -> NoReturn:
-    """Runs a job's main; turns a `UserError` into one line on stderr and its exit code.
+    """Runs a job's main; turns what a user can mend (`errors.told`) into one line on stderr and its exit code.
 
-    Of the processes of a machine the first tells it; a launcher shows it once more, after its own traceback.
+    Of the processes of a machine the first tells what all raise; a launcher shows it again, after its own traceback.
     """
     try:
         main()
         code = 0
-    except UserError as error:
-        line = f"{program_name()}: {error}"
-        if os.environ.get("LOCAL_RANK", "0") == "0":
-            print(line, file=sys.stderr)
-        tell_launcher(line)
-        code = error.exit_code
     except KeyboardInterrupt:
         print(f"{program_name()}: interrupted", file=sys.stderr)
         code = 130
     except BrokenPipeError:  # the reader (head, less) has left; that is not our failure
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
+    except Exception as error:
+        if (mended := told(error)) is None:
+            raise
+        line = f"{program_name()}: {mended}"
+        if mended is not error or os.environ.get("LOCAL_RANK", "0") == "0":
+            print(line, file=sys.stderr)
+        tell_launcher(line)
+        code = mended.exit_code
     sys.exit(code)
 
 

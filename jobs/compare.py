@@ -18,6 +18,7 @@ from typing import Literal
 
 from jobs.cli import parse, run_job
 from pipeline.common.errors import DataError, UsageError
+from pipeline.common.files import write_atomically
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,7 @@ def main() -> None:
     table = comparison.table(runs)
     table.print()
     folder = Path(job.output) / "comparison"
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "comparison.md").write_text(table.markdown())
-    (folder / "comparison.csv").write_text(table.csv())
+    write_atomically(folder / "comparison.csv", table.csv())
     written = [folder / "comparison.md", folder / "comparison.csv"]
     names = list(dict.fromkeys(run.name for run in runs))
     folders = [(name, Path(job.output) / name / "evaluation") for name in names]
@@ -69,9 +68,9 @@ def main() -> None:
             "\n"
             + "\n".join([significance.as_text(found)] * bool(found) + [f"not compared: {note}" for note in left_out])
         )
+    compared = "\n" + significance.as_markdown(found) if found else ""
+    write_atomically(folder / "comparison.md", table.markdown() + compared)
     if found:
-        with (folder / "comparison.md").open("a") as file:
-            file.write("\n" + significance.as_markdown(found))
         significance.write_csv(found, folder / "differences.csv")
         written.append(folder / "differences.csv")
     with also_as(job.figures_also):
@@ -98,8 +97,7 @@ def compare_evaluations(job: CompareJob) -> None:
         raise DataError("no two of these evaluations have the same queries of a set under the same protocol")
     print(significance.as_text(found))
     folder = Path(job.output) / "comparison"
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "differences.md").write_text(significance.as_markdown(found))
+    write_atomically(folder / "differences.md", significance.as_markdown(found))
     significance.write_csv(found, folder / "differences.csv")
     print(f"\nwritten: {folder / 'differences.md'}  {folder / 'differences.csv'}")
 

@@ -84,7 +84,7 @@ def main() -> None:
 
 def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None:
     """The evaluation on this process; rank 0 writes."""
-    from pipeline.distributed import on_rank_0
+    from pipeline.distributed import agreed, on_rank_0
     from pipeline.evaluation.evaluate import evaluate, projections_from
     from pipeline.evaluation.identity import model_digest
     from pipeline.evaluation.predictions import save_results
@@ -92,41 +92,48 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     from pipeline.evaluation.report.figures import also_as
     from pipeline.evaluation.report.page import write_page
     from pipeline.evaluation.report.pictures import draw
+    from pipeline.evaluation.sets.evaluation_set import EvaluationSet
     from pipeline.evaluation.sets.load import available, load_sets
     from pipeline.model.weights.files import checkpoint_file, read_metadata
     from pipeline.model.weights.load import load_any
 
     device, first = accelerator.device, accelerator.is_main_process  # type: ignore[attr-defined]
-    file = checkpoint_file(job.checkpoint)
+    file = agreed(partial(checkpoint_file, job.checkpoint))
     runs = [parent.parent for parent in file.parents if parent.name == "checkpoints"]
     output = Path(job.output) if job.output else (runs[0] if runs else file.parent) / "evaluation"
     on_rank_0(partial(check_writable, output, "--output"))
-    names = config.sets or tuple(a.name for a in available(config.root, config.split) if a.folder is not None)
-    sets, left_out = load_sets(names, config)
+
+    def find() -> tuple[list[EvaluationSet], list[str]]:
+        there = tuple(a.name for a in available(config.root, config.split) if a.folder is not None)
+        return load_sets(config.sets or there, config)
+
+    sets, left_out = agreed(find, what="reading the sets")
     for line in left_out if first else ():
         print(f"left out: {line}", file=sys.stderr)
-    model = load_any(file, device)
+    model = agreed(partial(load_any, file, device), what=f"loading {file}")
     fingerprint = model_digest(model)
     projections = projections_from(model, config, device, beside=file.parent, fingerprint=fingerprint)
     results = evaluate(model, sets, config, device, output, True, projections, fingerprint)
-    if not first:
-        return
-    tables.show(results)
-    about = {"checkpoint": str(file), "fingerprint": fingerprint, "descriptor_dim": model.descriptor_dim}
-    plain = {**about, "model": to_dict(model.config), "evaluation": recorded(config), "left_out": left_out}
-    save_results(results, sets, output, plain)
-    if job.figures:
-        with also_as(job.figures_also):
-            pictures = draw(results, sets, output / "figures", model)
-        facts = {key: str(value) for key, value in about.items()}
-        title = f"Evaluation of {(runs[0] if runs else file).name}"
-        write_page(results, pictures, output / "report.html", title, facts)
-    if job.track and runs:
-        from pipeline.training.records.tracking import record_evaluation
 
-        values = {name: value for entry in tables.as_dicts(results) for name, value in entry["metrics"].items()}
-        record_evaluation(runs[0], read_metadata(file)["extra"], values, output)
-    print(f"\nwritten to {output}/" + (": open report.html in a browser" if job.figures else ""))
+    def write() -> None:
+        tables.show(results)
+        about = {"checkpoint": str(file), "fingerprint": fingerprint, "descriptor_dim": model.descriptor_dim}
+        plain = {**about, "model": to_dict(model.config), "evaluation": recorded(config), "left_out": left_out}
+        save_results(results, sets, output, plain)
+        if job.figures:
+            with also_as(job.figures_also):
+                pictures = draw(results, sets, output / "figures", model)
+            facts = {key: str(value) for key, value in about.items()}
+            title = f"Evaluation of {(runs[0] if runs else file).name}"
+            write_page(results, pictures, output / "report.html", title, facts)
+        if job.track and runs:
+            from pipeline.training.records.tracking import record_evaluation
+
+            values = {name: value for entry in tables.as_dicts(results) for name, value in entry["metrics"].items()}
+            record_evaluation(runs[0], read_metadata(file)["extra"], values, output)
+        print(f"\nwritten to {output}/" + (": open report.html in a browser" if job.figures else ""))
+
+    on_rank_0(write, what=f"writing the results into {output}")
 
 
 def stored(job: EvaluateJob, folder: Path, config: EvaluationConfig) -> None:

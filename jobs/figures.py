@@ -22,7 +22,7 @@ from typing import Any, Literal
 from jobs.cli import parse, run_job
 from jobs.there import need_sets
 from pipeline.common.errors import DataError, UsageError
-from pipeline.common.files import check_writable
+from pipeline.common.files import check_writable, write_atomically
 from pipeline.config import EvaluationConfig, ModelConfig
 from pipeline.model.weights.where import check_weights
 
@@ -106,8 +106,7 @@ def parameters(job: FiguresJob) -> None:
     print("Parameters in millions")
     table.print()
     if job.to:
-        Path(job.to).parent.mkdir(parents=True, exist_ok=True)
-        Path(job.to).write_text(table.markdown())
+        write_atomically(Path(job.to), table.markdown())
         print(f"\nwritten to {job.to}")
 
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Literal
 from jobs.cli import parse, run_job
 from jobs.there import need_model
 from pipeline.common.errors import DataError, UsageError
-from pipeline.common.files import check_writable
+from pipeline.common.files import check_writable, write_atomically
 from pipeline.config import SearchKind
 
 if TYPE_CHECKING:
@@ -231,11 +231,10 @@ def tell(job: LocateJob, index: PhotoIndex, answers: Sequence[Answer]) -> None:
             f"\n* within {job.radius:g} m of the photo's own position; {sum(known)} of {len(known)} first answers are"
         )
     output = output_of(job)
-    output.mkdir(parents=True, exist_ok=True)
     about = {"index": str(index.folder), "fingerprint": index.about["fingerprint"], "protocol": index.about["protocol"],
              "utm_zone": index.zone, "no_match_from": index.calibration.threshold}  # fmt: skip
     rows = [answer.to_dict() for answer in answers]
-    (output / "answers.json").write_text(json.dumps({**about, "photos": rows}, indent=2) + "\n")
+    write_atomically(output / "answers.json", json.dumps({**about, "photos": rows}, indent=2) + "\n")
     written = [output / "answers.json"]
     for path in map(Path, job.to):
         export(answers, index, path)

@@ -71,14 +71,15 @@ def write_shards(catalogue: Catalogue, out: Path, rule: WriteRule | None = None)
     PNG is converted, rather than left out, unless the source is GSV-Cities, whatever `rule.image.convert` says.
 
     Raises:
-        UsageError: impossible settings; `out` holds another set, other files, or another run at work; a full disk.
-        DataError: more than `max_bad` of the images are missing or broken (all named in report.csv), or no place has
-            four images.
+        UsageError: impossible settings; `out` holds another set, other files, or another run at work.
+        DataError: a full disk; more than `max_bad` of the images are missing or broken (all named in report.csv); no
+            place has four images.
     """
     try:
         return _write(catalogue, out, _completed(rule or WriteRule(), catalogue))
     except OSError as error:
-        raise UsageError(f"{readable(out)}: {error}; finished shards are kept, the same command continues") from error
+        reason = error.strerror or str(error)
+        raise DataError(f"{readable(out)}: {reason}; finished shards are kept, the same command continues") from error
 
 
 def _write(catalogue: Catalogue, out: Path, rule: WriteRule) -> report.Summary:

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, BinaryIO
 
-from pipeline.common.errors import UsageError
+from pipeline.common.errors import UsageError, UserError, told
 from pipeline.common.text import shown
 
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
@@ -50,12 +50,31 @@ def locked(path: Path, refusal: str = "", patience: float = 0.0) -> Iterator[Non
         yield
 
 
-def write_atomically(path: Path, data: bytes, temporary: Path | None = None) -> None:
-    """Writes a small file so that it is either whole under its name or not there at all, even if the power fails."""
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Errors of writing inside name the file: the system's (a full disk is told when bytes are written, and then names
+    none), and those of libraries, which become `DataError`."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
+    except Exception as error:
+        if isinstance(error, UserError) or (mended := told(error, str(path))) is None:
+            raise
+        raise mended from error
+
+
+def write_atomically(path: Path, data: bytes | str, temporary: Path | None = None) -> None:
+    """Writes a small file so that it is either whole under its name or not there at all, even if the power fails. Its
+    folder is made where it is missing; text is written as UTF-8."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = data.encode(errors="surrogateescape") if isinstance(data, str) else data
     temporary = temporary or path.with_name(path.name + ".tmp")
     try:
-        with temporary.open("wb") as stream:
-            stream.write(data)
+        with naming(path), temporary.open("wb") as stream:
+            stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
         temporary.rename(path)
@@ -74,7 +93,8 @@ def replacing(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
     try:
-        yield partial
+        with naming(path):
+            yield partial
         usual_permissions(partial)
         partial.replace(path)
     finally:
@@ -120,14 +140,12 @@ def unnamed_file(size: int, folder: Path | None = None) -> IO[bytes]:
     return file
 
 
-def _take_room(file: IO[bytes], size: int, told: Path) -> None:
-    if not hasattr(os, "posix_fallocate"):
-        file.truncate(size)
-        return
-    try:
-        os.posix_fallocate(file.fileno(), 0, size)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(told)) from None
+def _take_room(file: IO[bytes], size: int, path: Path) -> None:
+    with naming(path):
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
+        else:
+            file.truncate(size)
 
 
 def open_ordinary(path: Path) -> BinaryIO:

@@ -41,7 +41,7 @@ def context() -> BaseContext:
     none is lost, since the trainer's own mask is as before afterwards.
     """
     forkserver = multiprocessing.get_context("forkserver")
-    forkserver.set_forkserver_preload(["pipeline.data.places"])
+    forkserver.set_forkserver_preload(["pipeline.data.fork_server", "pipeline.data.places"])
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
     try:
         multiprocessing.resource_tracker.ensure_running()  # leaves SIGTERM unblocked

@@ -21,7 +21,7 @@ from torch import nn
 
 from pipeline.common.files import locked
 from pipeline.config import EvaluationConfig
-from pipeline.distributed import held_on_rank_0, on_rank_0, same
+from pipeline.distributed import agreed, held_on_rank_0, on_rank_0, same
 from pipeline.evaluation.describe.bank import chosen_bank
 from pipeline.evaluation.describe.encode import evaluating
 from pipeline.evaluation.describe.sides import Engine
@@ -132,6 +132,7 @@ def evaluate(
         check_prefix(config.prefix, int(engine.model.descriptor_dim))
         second = Described(build_reranker(model, config, device)) if config.rerank else None
         bank = None
+        same(", ".join(evaluated.name for evaluated in sets), "the list of sets")
         for evaluated in sets:
             same(_names_digest(evaluated), f"the digest of the photo names of {evaluated.name}")
             if bank is None or config.bank_from == "map":  # only that one is another for each set
@@ -176,7 +177,7 @@ def projections_from(
     """`fit_projections` on the set that `config.pca_from` names; None where it names none, or there is no PCA."""
     if not config.pca or not config.pca_from:
         return None
-    source = load_set(config.pca_from, dataclasses.replace(config, split="train"))
+    source = agreed(partial(load_set, config.pca_from, dataclasses.replace(config, split="train")))
     return fit_projections(model, source, config, device, progress, beside, fingerprint)
 
 
@@ -290,9 +291,9 @@ def answer_queries(
         if (inside := np.isin(numbers, sample)).any():
             exact.append(search(asked[inside], database(), k)[1])
             near.append(found[numbers[inside]])
-    agreed = agreement(np.concatenate(near), np.concatenate(exact))
+    share = agreement(np.concatenate(near), np.concatenate(exact))
     what = protocol.search + (f", refined among {protocol.refine}," if protocol.refine else "")
-    remark = f"{what} finds {agreed:.1f} % of the exact {k} neighbours ({len(sample):,} queries), index"
+    remark = f"{what} finds {share:.1f} % of the exact {k} neighbours ({len(sample):,} queries), index"
     cost = SearchCost(*bytes_each(index), 1e3 * clock.seconds / len(found))
     return Answers(found, distances, (f"{remark} {index_bytes(index) / 1e6:,.1f} MB",), cost)
 

@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.common.errors import DataError
-from pipeline.common.files import replacing
+from pipeline.common.files import replacing, write_atomically
 from pipeline.common.text import shown
 from pipeline.evaluation.evaluate import Result
 from pipeline.evaluation.protocol import Protocol, read_protocol
@@ -77,7 +77,7 @@ def save_results(results: Sequence[Result], sets: Sequence[EvaluationSet], outpu
     """
     tables.write_json(results, output / "results.json", about)
     tables.write_csv(results, output / "results.csv")
-    (output / "results.md").write_text(tables.markdown(results))
+    write_atomically(output / "results.md", tables.markdown(results))
     for result in results:
         evaluated = next(s for s in sets if s.name == result.set_name)
         kept = save_predictions(result, evaluated, output / "predictions")

@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.common.errors import DataError
-from pipeline.common.files import sync_path, unnamed_file
+from pipeline.common.files import replacing, sync_path, unnamed_file
 from pipeline.evaluation.search.exact import Blocks, slices
 
 META = b"place_recognition_photos"
@@ -105,7 +105,7 @@ class KeptDescriptors:
         for number, file in self._parts().items():
             if number not in needed:
                 file.unlink()
-        for stale in self.folder.glob("*.tmp"):
+        for stale in self.folder.glob(".*.partial"):
             stale.unlink()
         files = self._parts()
         rows = sum(pq.read_metadata(file).num_rows for file in files.values())
@@ -138,12 +138,10 @@ class KeptDescriptors:
                 "descriptor": pa.FixedSizeListArray.from_arrays(pa.array(descriptors.ravel()), descriptors.shape[1]),
             }
         ).replace_schema_metadata({META: self.key})
-        self.folder.mkdir(parents=True, exist_ok=True)
         file = self.folder / f"part-{max(self._parts(), default=-1) + 1:06d}.parquet"
-        fresh = file.with_suffix(".tmp")
-        pq.write_table(table, fresh, compression="none", use_dictionary=["photo"], write_statistics=False)
-        sync_path(fresh)
-        fresh.replace(file)
+        with replacing(file) as fresh:
+            pq.write_table(table, fresh, compression="none", use_dictionary=["photo"], write_statistics=False)
+            sync_path(fresh)
 
     def _parts(self) -> dict[int, Path]:
         return {int(f.stem.removeprefix("part-")): f for f in sorted(self.folder.glob("part-*.parquet"))}

@@ -42,8 +42,7 @@ def export(answers: Sequence[Answer], index: PhotoIndex, path: Path) -> None:
     """
     check_format(path)
     write = {".geojson": geojson, ".csv": csv, ".kml": kml, ".txt": pairs}[path.suffix.lower()]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, write(answers, index).encode(errors="surrogateescape"))
+    write_atomically(path, write(answers, index))
 
 
 def table(answers: Sequence[Answer], index: PhotoIndex) -> Table:

@@ -29,7 +29,7 @@ import torch
 from torch import nn
 
 from pipeline.common.errors import DataError, UsageError
-from pipeline.common.files import locked, sync_path, write_atomically
+from pipeline.common.files import locked, naming, sync_path, write_atomically
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.describe.bank import chosen_bank
 from pipeline.evaluation.describe.encode import describe_each, evaluating
@@ -179,7 +179,7 @@ def make_index(
             taken = np.concatenate([block[np.isin(rows, asked)] for rows, block in blocks()])
             calibration = calibrate(built, photos, asked, taken, apart)
             near = {"how": calibration.how, "elsewhere": calibration.elsewhere.tolist()}
-            (place / CALIBRATION).write_text(json.dumps(near) + "\n")
+            write_atomically(place / CALIBRATION, json.dumps(near) + "\n")
             _write_photos(photos, place / PHOTOS)
             for file in [*place.iterdir(), place]:
                 sync_path(file)
@@ -199,7 +199,7 @@ def make_index(
                 "remarks": list(photos.remarks),
                 **(about or {}),
             }
-            write_atomically(folder / ABOUT, (json.dumps(whole, indent=2) + "\n").encode())  # from here on it answers
+            write_atomically(folder / ABOUT, json.dumps(whole, indent=2) + "\n")  # from here on it answers
         _clean(folder, place)
         kept.tidy(photos.files, photos.states, found)
     return dataclasses.replace(open_index(folder, fingerprint), growth=growth)
@@ -327,7 +327,8 @@ def _write_photos(photos: Photos, file: Path) -> None:
     for (first, second), pair in ((("first", "second"), photos.positions), (("lat", "lon"), photos.degrees)):
         values = empty if pair is None else pair
         table[first], table[second] = (pa.array(values[:, i], from_pandas=True) for i in (0, 1))  # NaN is null
-    pq.write_table(pa.table(table), file)
+    with naming(file):
+        pq.write_table(pa.table(table), file)
 
 
 def _place(folder: Path, about: dict[str, Any]) -> Path:

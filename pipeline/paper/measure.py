@@ -9,14 +9,18 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pipeline.common.files import write_atomically
 from pipeline.config import EvaluationConfig, from_dict, recorded, to_dict
+from pipeline.distributed import agreed, on_rank_0
 from pipeline.evaluation.evaluate import Result, evaluate, projections_from
 from pipeline.evaluation.identity import model_digest
 from pipeline.evaluation.predictions import save_predictions
 from pipeline.evaluation.report import tables
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
 from pipeline.evaluation.sets.load import load_set
 from pipeline.model.weights.files import checkpoint_file, load_model, read_metadata
 from pipeline.paper.plan import Cell
@@ -40,9 +44,8 @@ def predictions_folder(run: Path, cell: Cell) -> Path:
 def write_order(run: Path, cells: Sequence[Cell]) -> Path:
     """The evaluations to do, as a file for `measure`."""
     path = folder(run) / "order.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
     orders = {cell.key: to_dict(cell.config) for cell in cells}
-    path.write_text(json.dumps({"run": str(run), "evaluations": orders}, indent=1) + "\n")
+    write_atomically(path, json.dumps({"run": str(run), "evaluations": orders}, indent=1) + "\n")
     return path
 
 
@@ -52,28 +55,40 @@ def measure(order: Path, accelerator: Any) -> None:
     Raises:
         DataError, UsageError: a set or the run's model cannot be read; the same on all ranks.
     """
-    told = json.loads(order.read_text())
+    told = agreed(lambda: json.loads(order.read_text()))
     run = Path(told["run"])
-    file, output = checkpoint_file(run), folder(run)
-    model = load_model(file, accelerator.device)
+    file, output = agreed(lambda: checkpoint_file(run)), folder(run)
+    model = agreed(lambda: load_model(file, accelerator.device), what=f"loading {file}")
     fingerprint = model_digest(model)
     configs = {key: from_dict(EvaluationConfig, values) for key, values in told["evaluations"].items()}
     for key, config in configs.items():
         projections = projections_from(model, config, accelerator.device, beside=file.parent, fingerprint=fingerprint)
-        sets = [load_set(name, config) for name in config.sets]
+        sets = agreed(partial(_sets, config))
         results = evaluate(model, sets, config, accelerator.device, output, True, projections, fingerprint)
-        if accelerator.is_main_process:
-            for result in results:
-                save_predictions(result, next(s for s in sets if s.name == result.set_name), output / key)
-            _keep(run, output / f"{key}.json", file, config, results)
+        on_rank_0(
+            partial(_keep, run, output / f"{key}.json", file, config, sets, results), what=f"writing into {output}"
+        )
     if accelerator.is_main_process:
         # descriptors were kept only so that several PCAs need not describe the images again
         shutil.rmtree(output / "descriptors", ignore_errors=True)
 
 
-def _keep(run: Path, path: Path, file: Path, config: EvaluationConfig, results: Sequence[Result]) -> None:
+def _sets(config: EvaluationConfig) -> list[EvaluationSet]:
+    return [load_set(name, config) for name in config.sets]
+
+
+def _keep(
+    run: Path,
+    path: Path,
+    file: Path,
+    config: EvaluationConfig,
+    sets: Sequence[EvaluationSet],
+    results: Sequence[Result],
+) -> None:
     from pipeline.training.records.tracking import record_evaluation
 
+    for result in results:
+        save_predictions(result, next(s for s in sets if s.name == result.set_name), path.with_suffix(""))
     temporary = path.with_suffix(".part")
     tables.write_json(results, temporary, {"checkpoint": str(file), "evaluation": recorded(config)})
     values = {name: value for entry in tables.as_dicts(results) for name, value in entry["metrics"].items()}

@@ -21,6 +21,7 @@ from types import FrameType
 from typing import Any
 
 from pipeline.common.errors import Diverged, Preempted, UserError
+from pipeline.common.files import write_atomically
 from pipeline.config import recorded
 from pipeline.evaluation.protocol import Protocol, read_protocol
 from pipeline.evaluation.report import tables
@@ -84,7 +85,7 @@ class Runner:
 
         store_uri(training.config.tracking.uri, str(self.output))  # a password goes on by the environment
         settings = run / "training.yaml"
-        settings.write_text(yaml.safe_dump(recorded(training.config), sort_keys=False))
+        write_atomically(settings, yaml.safe_dump(recorded(training.config), sort_keys=False))
         (run / "status.json").unlink(missing_ok=True)  # of an earlier attempt
         code = self._start("jobs.train", "--config", str(settings))
         if code == 0:

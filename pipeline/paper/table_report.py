@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from pipeline.common.files import write_atomically
 from pipeline.common.text import Table, csv_text, markdown_text, printable
 from pipeline.evaluation.protocol import Protocol
 from pipeline.evaluation.sets.registry import published_name
@@ -125,11 +126,10 @@ def write(study: Study, compared: Sequence[paired.Paired], folder: Path) -> None
 
     `compared`: from `paired.paired`.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "table.md").write_text(markdown(study, compared))
-    (folder / "table.csv").write_text(csv_text(_long_form(study)))
+    write_atomically(folder / "table.md", markdown(study, compared))
+    write_atomically(folder / "table.csv", csv_text(_long_form(study)))
     if compared:
-        (folder / "paired.csv").write_text(paired.csv(compared))
+        write_atomically(folder / "paired.csv", paired.csv(compared))
     draw(study, folder / "table.png")
 
 

@@ -138,7 +138,7 @@ def point(run: Path, name: str, target: Path) -> None:
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        write_atomically(link, (target.name + "\n").encode())
+        write_atomically(link, target.name + "\n")
         return
     temporary.replace(link)
     sync_path(link.parent)

@@ -444,7 +444,7 @@ class Trainer:
             self.run.mkdir(parents=True, exist_ok=True)
             for log in self.run.glob("samples.rank*.jsonl"):  # also those of a former, larger number of ranks
                 self._forget_samples(log)
-            write_atomically(self.run / "config.json", (json.dumps(recorded(config), indent=1) + "\n").encode())
+            write_atomically(self.run / "config.json", json.dumps(recorded(config), indent=1) + "\n")
             # a run killed before its first checkpoint left its id here
             known = self.state.run_id or (note.read_text().strip() if note.exists() else "")
             self.tracker = Tracker(config, known, config.tracking.enabled)
@@ -472,7 +472,7 @@ class Trainer:
         whole = [line for line in before.splitlines() if line.endswith("}")]
         kept = "".join(line + "\n" for line in whole if json.loads(line)["step"] <= self.state.step)
         if kept != before:
-            write_atomically(log, kept.encode())
+            write_atomically(log, kept)
 
     def _log_samples(self, keys: list[str]) -> None:
         """One line a step; what goes wrong is told in the ranks' next exchange, since the others are in their step."""

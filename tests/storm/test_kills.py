@@ -50,6 +50,7 @@ class Tally:
     ended_before: int = 0
     slowest_end: float = 0.0
     """Seconds from a kill until the last process of the job is gone, the ranks that were not killed included."""
+    slowest_said: str = ""
     lost: int = 0
     repeated: int = 0
     left_over: list[str] = field(default_factory=list)
@@ -102,7 +103,9 @@ class Work:
                 self.tally.left_over.append(f"rank that did not end:\n{process.text()[-2000:]}")
         while (left := of_groups(group)) and time.monotonic() < killed + 60:
             time.sleep(0.05)
-        self.tally.slowest_end = max(self.tally.slowest_end, time.monotonic() - killed)
+        if (took := time.monotonic() - killed) > self.tally.slowest_end:
+            self.tally.slowest_end = took
+            self.tally.slowest_said = "\n".join(process.text()[-2000:] for process in job.ranks)
         self.tally.left_over += [f"process {pid}" for pid in left]
         for pid in left:
             os.kill(pid, signal.SIGKILL)
@@ -286,7 +289,7 @@ def judge(found: dict[str, Tally], least: int) -> None:
     assert sum(tally.kills for tally in found.values()) >= least
     for name, tally in found.items():
         assert (tally.lost, tally.repeated, tally.left_over) == (0, 0, []), f"{name}: {tally}"
-        assert tally.slowest_end < SOON, f"{name}: {tally}"
+        assert tally.slowest_end < SOON, f"{name}: {tally}\n{tally.slowest_said}"
 
 
 def test_a_few_kills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,12 +62,7 @@ def chosen_bank(
         return model.bank.first(config.bank)
     paths: Sequence[Path] = database
     if config.bank_from != "map":
-        folder = Path(config.bank_from)
-        if not folder.is_dir():
-            raise UsageError(f"bank_from {config.bank_from}: give train, map, or an existing folder of photos")
-        paths = list_images(folder)
-        if not paths:
-            raise UsageError(f"bank_from {config.bank_from}: no photos in this folder")
+        paths = agreed(partial(_photos_of_bank, Path(config.bank_from)))
     chosen = [paths[p] for p in drawn(len(paths), config.bank, 0)]
     source = config.bank_from if config.bank_from == "map" else Path(config.bank_from).resolve().name
 
@@ -75,6 +70,14 @@ def chosen_bank(
         return torch.stack([to_input(load_image(path), model.image_size, config.resize) for path in chosen])
 
     return encode_bank(model, agreed(read, what="reading the bank"), source, config, device)
+
+
+def _photos_of_bank(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise UsageError(f"bank_from {folder}: give train, map, or an existing folder of photos")
+    if paths := list_images(folder):
+        return paths
+    raise UsageError(f"bank_from {folder}: no photos in this folder")
 
 
 def encode_bank(

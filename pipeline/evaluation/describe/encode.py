@@ -28,7 +28,7 @@ from torch import Tensor, nn
 
 from pipeline import distributed
 from pipeline.common.errors import told
-from pipeline.common.files import reserve, unnamed_file
+from pipeline.common.files import replacing, reserve, unnamed_file
 from pipeline.common.progress import Progress
 from pipeline.config import EvaluationConfig
 from pipeline.data import workers
@@ -375,9 +375,8 @@ class _Resume:
         self.done = done
         if self.file is not None and isinstance(values, np.memmap) and (final or done % 64 == 0):
             values.flush()
-            fresh = self.file.with_suffix(".tmp")
-            fresh.write_text(json.dumps({"key": self.key, "done": done}))
-            fresh.replace(self.file)
+            with replacing(self.file) as fresh:
+                fresh.write_text(json.dumps({"key": self.key, "done": done}))
 
 
 def _allocate(shape: tuple[int, ...], dtype: torch.dtype, scratch: Path | None, key: str) -> tuple[np.ndarray, _Resume]:

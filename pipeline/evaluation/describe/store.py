@@ -20,6 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.common.errors import DataError
+from pipeline.common.files import replacing
 from pipeline.evaluation.identity import Identity
 from pipeline.evaluation.protocol import Protocol, read_protocol
 
@@ -61,7 +62,8 @@ class StoreWriter:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.done = frozenset(n for n in range(parts) if self._part_belongs(n))
         keep = {self._part(n).name for n in self.done}
-        for file in self.folder.glob("part-*"):  # stale parts of another key, and temporary files of a killed run
+        # stale parts of another key, and what a killed run left
+        for file in [*self.folder.glob("part-*"), *self.folder.glob(".part-*")]:
             if file.name not in keep:
                 file.unlink()
 
@@ -86,16 +88,9 @@ class StoreWriter:
                 "descriptor": pa.FixedSizeListArray.from_arrays(pa.array(flat), descriptors.shape[1]),
             }
         ).replace_schema_metadata({META: json.dumps(self._about)})
-        fresh = self._part(number).with_suffix(".tmp")
-        # descriptors neither compress nor repeat: plain pages are smaller in time and no larger on disk
-        try:
+        with replacing(self._part(number)) as fresh:
+            # descriptors neither compress nor repeat: plain pages are smaller in time and no larger on disk
             pq.write_table(table, fresh, compression="none", use_dictionary=False, write_statistics=["row"])
-        except OSError as error:
-            fresh.unlink(missing_ok=True)  # a full disk has room again
-            raise DataError(
-                f"{self.folder}: descriptors cannot be written ({error}); finished parts are kept"
-            ) from error
-        fresh.replace(self._part(number))
         self.done |= {number}
 
     def _part(self, number: int) -> Path:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from pipeline.common.files import naming
 from pipeline.common.text import printable
 from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.evaluate import Result
@@ -84,16 +85,18 @@ def canvas(width: float, height: float, path: Path, layout: Any = "constrained",
         figure = Figure(figsize=(width, height), layout=layout)
         FigureCanvasAgg(figure)
         yield figure
-        path.parent.mkdir(parents=True, exist_ok=True)
         vector = path.suffix in VECTOR
         jpeg: Any = {"pil_kwargs": {"quality": 88}} if path.suffix == ".jpg" else {}
-        figure.savefig(path, dpi=PAPER_DPI if vector else dpi, metadata=_undated(path), **jpeg)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with naming(path):
+            figure.savefig(path, dpi=PAPER_DPI if vector else dpi, metadata=_undated(path), **jpeg)
         for ending in _also.get():
             # beside x.jpg a photo figure's x.png; beside x.png, which is there at screen size, x.300dpi.png
             other = (
                 path.with_suffix(f".{ending}") if path.suffix != f".{ending}" else path.with_suffix(f".300dpi.{ending}")
             )
-            figure.savefig(other, dpi=PAPER_DPI, metadata=_undated(other))
+            with naming(other):
+                figure.savefig(other, dpi=PAPER_DPI, metadata=_undated(other))
 
 
 def _undated(path: Path) -> Any:

@@ -39,8 +39,7 @@ def write_page(
         notes=notes(results),
         sets={name: [_shown(picture) for picture in pictures if picture.set_name == name] for name in names},
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, page.encode())
+    write_atomically(path, page)
 
 
 def _shown(picture: Picture) -> dict[str, object]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.common.files import write_atomically
 from pipeline.common.text import Table, csv_text, shown
 from pipeline.evaluation.difference import Difference, difference
 from pipeline.evaluation.predictions import Predictions, load_predictions
@@ -99,7 +100,7 @@ def write_csv(found: Sequence[Difference], path: Path) -> None:
         interval = [*d.recalls, d.value, d.low, d.high]
         counts = [d.gained, d.lost, d.queries]
         lines.append([*d.runs, d.set_name, d.protocol, d.k, *interval, *counts, d.p_value, d.real])
-    path.write_text(csv_text(lines))
+    write_atomically(path, csv_text(lines))
 
 
 def _in(evaluation: Path) -> dict[str, Path]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.common.errors import DataError
+from pipeline.common.files import write_atomically
 from pipeline.common.text import Table, csv_text, markdown_text, printable
 from pipeline.evaluation.evaluate import Result, SearchCost
 from pipeline.evaluation.protocol import Protocol, metric_name
@@ -149,8 +150,7 @@ def as_dicts(results: Iterable[Result]) -> list[dict[str, Any]]:
 def write_json(results: Sequence[Result], path: Path, about: dict[str, Any]) -> None:
     """`{"format_version", **about, "results": [...]}`; `about` says which checkpoint, with its config and digest."""
     whole = {"format_version": FORMAT_VERSION, **about, "results": as_dicts(results)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(whole, indent=2) + "\n")
+    write_atomically(path, json.dumps(whole, indent=2) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -175,8 +175,7 @@ def write_csv(results: Sequence[Result], path: Path) -> None:
             counts = [r.queries, r.database, r.without_positives]
             cost = [] if r.cost is None else list(dataclasses.asdict(r.cost).values())
             lines.append([r.set_name, r.protocol.name, k, value, *counts, *r.protocol.to_dict().values(), *cost])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(csv_text(lines))
+    write_atomically(path, csv_text(lines))
 
 
 def _by_set(results: Sequence[Result]) -> list[tuple[str, list[Result]]]:

@@ -118,7 +118,11 @@ def save_index(index: Any, path: Path) -> None:
     import faiss
 
     with replacing(path) as fresh:
-        faiss.write_index(index, str(fresh))
+        try:
+            faiss.write_index(index, str(fresh))
+        except RuntimeError as error:
+            reason = str(error).splitlines()[0].rpartition(": ")[2]
+            raise DataError(f"{path}: the search index cannot be written ({reason})") from error
 
 
 def load_index(path: Path) -> Any:

@@ -160,8 +160,9 @@ def write_model(model: PlaceModel, path: Path, source: str) -> None:
 
 def write_published(model: PlaceModel, path: Path) -> None:
     """A .pth of published names, tensors alone: what the published code's `load_state_dict` takes."""
-    with replacing(path) as partial:
-        torch.save(to_published(model.state_dict()), partial)
+    # given a path, torch would wrap a full disk in an error of its own
+    with replacing(path) as partial, partial.open("wb") as file:
+        torch.save(to_published(model.state_dict()), file)
 
 
 def write_backbone(source: str, config: BackboneConfig, path: Path) -> dict[str, Tensor]:

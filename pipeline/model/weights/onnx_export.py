@@ -12,7 +12,7 @@ import contextlib
 import importlib.util
 import json
 import logging
-import tempfile
+import shutil
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pipeline.common.errors import DataError, UsageError
+from pipeline.common.files import naming
 from pipeline.config import to_dict
 from pipeline.data.images import MEAN, STD
 from pipeline.model.beside import BesideBank
@@ -67,13 +68,17 @@ def export_onnx(model: PlaceModel, path: Path, output: Output = "descriptors") -
     if absent:
         raise UsageError(f"ONNX export needs {', '.join(absent)}: pip install 'place-recognition-training[onnx]'")
     model = model.float().cpu().eval()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".partial-") as folder:
-        file = Path(folder) / path.name
-        _write(model, file, output)
-        difference = check(model, file, output)
-        for written in sorted(Path(folder).iterdir(), key=lambda f: f == file):  # the model itself comes last
+    folder = path.with_name(f".{path.name}.partial")
+    shutil.rmtree(folder, ignore_errors=True)  # of a killed export
+    try:
+        with naming(path):
+            folder.mkdir(parents=True)
+            _write(model, folder / path.name, output)
+        difference = check(model, folder / path.name, output)
+        for written in sorted(folder.iterdir(), key=lambda f: f.name == path.name):  # the model itself comes last
             written.replace(path.parent / written.name)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
     return difference
 
 

@@ -164,7 +164,7 @@ def _refused(run: Path, error: OSError) -> UserError:
 def _write(path: Path, status: Status) -> None:
     """Whole or not at all."""
     path.with_name(ROOM).unlink(missing_ok=True)  # on a full disk, the room for what follows
-    data = (json.dumps(asdict(status), indent=1) + "\n").encode()
+    data = json.dumps(asdict(status), indent=1) + "\n"
     write_atomically(path, data, path.with_name(f".status-{os.getpid()}"))
 
 

@@ -11,6 +11,8 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from pipeline.common.files import naming, write_atomically
+
 LOG, PICTURE = "train.log", "curves.png"
 FEWEST = 20  # records; a curve of fewer says little, and costs the import of matplotlib
 
@@ -25,11 +27,11 @@ class RunLog:
     def __init__(self, run: Path, step: int) -> None:
         self.file = run / LOG
         kept = [line for line in _lines(self.file) if int(line.split()[1]) <= step]
-        self.file.write_text("".join(f"{line}\n" for line in kept))
+        write_atomically(self.file, "".join(f"{line}\n" for line in kept))
 
     def write(self, values: Mapping[str, float], step: int) -> None:
         """One line."""
-        with self.file.open("a") as log:
+        with naming(self.file), self.file.open("a") as log:
             log.write("  ".join([f"step {step}", *(f"{name} {value:.6g}" for name, value in values.items())]) + "\n")
 
 
@@ -67,7 +69,8 @@ def draw(run: Path, fewest: int = FEWEST) -> Path | None:
     if recalls:
         panels[1].set(xlabel="step", ylabel="recall, %", title="validation", ylim=(0, 100))
         panels[1].legend(fontsize="small")
-    figure.savefig(run / PICTURE, dpi=150)
+    with naming(run / PICTURE):
+        figure.savefig(run / PICTURE, dpi=150)
     return run / PICTURE
 
 

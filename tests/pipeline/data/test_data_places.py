@@ -235,6 +235,35 @@ def test_workers_outlive_a_schedulers_signals_and_never_their_trainer(small_set:
     assert in_group(process.pid) == set()
 
 
+SLOW_TORCH = """
+import time
+from pathlib import Path
+Path(__file__).with_name("importing").touch()
+time.sleep(100)
+"""
+
+
+def test_the_fork_server_does_not_finish_its_imports_without_its_trainer(tmp_path: Path) -> None:
+    (tmp_path / "torch.py").write_text(SLOW_TORCH)
+    program = "import sys\nfrom pipeline.data import workers\nworkers.context()\nsys.stdin.read()"
+    path = os.pathsep.join([str(tmp_path), str(Path(__file__).resolve().parents[3])])
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, start_new_session=True,
+        env={**os.environ, "PYTHONPATH": path},
+    )  # fmt: skip
+    deadline = time.monotonic() + 30
+    while not (tmp_path / "importing").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 10
+    while (left := in_group(process.pid)) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    assert not left and (tmp_path / "importing").exists()
+
+
 def test_shards_written_by_this_project_give_back_their_photos(make_photo: Make, tmp_path: Path) -> None:
     """Folders of photos -> jobs.prepare's writer -> read_index -> batches: the source files' pixels, by rounds."""
     source: dict[int, dict[bytes, str]] = {}

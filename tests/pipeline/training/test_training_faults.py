@@ -221,7 +221,7 @@ def test_faults_of_an_evaluation_end_both_alike(root: Path, tmp_path: Path) -> N
         assert one[name][:2] == (code, message)
     assert [zero[name][0] for name in ("store", "regions", "photo", "none")] == [3, 3, 3, 0]
     assert zero["store"][1].startswith(f"rank 0: {tmp_path}/store/descriptors/") and "too large" in zero["store"][1]
-    assert not list((tmp_path / "store").rglob("*.tmp"))
+    assert not list((tmp_path / "store").rglob("*.partial"))
     assert zero["regions"][1].startswith("rank 1: ") and "regions.1.bin" in zero["regions"][1]
     assert broken.name in zero["photo"][1]
 

@@ -70,12 +70,12 @@ def test_half_precision_is_half_the_size_and_close(tmp_path: Path) -> None:
 
 def test_a_killed_run_continues_behind_its_last_part(tmp_path: Path) -> None:
     folder = write(tmp_path, parts=2).folder
-    (folder / "part-00002.tmp").write_bytes(b"half a part")
+    (folder / ".part-00002.parquet.partial").write_bytes(b"half a part")
     with pytest.raises(DataError, match="2 of 5 parts"):
         DescriptorStore(folder)
     before = {f.name: f.stat().st_mtime_ns for f in folder.glob("*.parquet")}
     writer = StoreWriter(at(tmp_path), KEY, PATHS, PLACES, len(BLOCKS))
-    assert writer.done == {0, 1} and not writer.complete and not list(folder.glob("*.tmp"))
+    assert writer.done == {0, 1} and not writer.complete and not list(folder.glob(".*"))
     assert write(tmp_path).complete
     assert all((folder / name).stat().st_mtime_ns == when for name, when in before.items())
     assert (DescriptorStore(folder).array() == VALUES).all()

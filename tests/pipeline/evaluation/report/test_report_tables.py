@@ -249,7 +249,7 @@ def test_figures_for_a_paper(street: EvaluationSet, tmp_path: Path) -> None:
     assert draws[0]["c.pdf"].startswith(b"%PDF") and b"a = b   R@1 50.0" in draws[0]["c.svg"]
     with Image.open(tmp_path / "first/c.png") as small, Image.open(tmp_path / "first/c.300dpi.png") as large:
         assert large.width / small.width == pytest.approx(300 / figures.DPI, rel=0.01)
-    assert not list((tmp_path / "second").glob("*.tmp"))
+    assert not list((tmp_path / "second").glob(".*"))
 
 
 def test_curves_that_coincide_share_a_line_and_intervals_hold_the_share() -> None:
