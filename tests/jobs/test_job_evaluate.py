@@ -14,8 +14,18 @@ import pytest
 import torch
 from job_process import JobProcess
 from PIL import Image
+from processes import run_ranks
 
-from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig, PoolingConfig
+from pipeline.common.errors import DataError, UserError
+from pipeline.config import (
+    AdapterConfig,
+    BackboneConfig,
+    CrossImageConfig,
+    EvaluationConfig,
+    ModelConfig,
+    PoolingConfig,
+)
+from pipeline.distributed import rank
 from pipeline.model.vpr import build_model
 from pipeline.model.weights.files import save_model
 
@@ -128,3 +138,57 @@ def test_the_challenge_is_written_in_the_line_format_of_its_server(run_folder: P
         [f"{city}_q{i}", f"{city}_d{i}"] for city in ("athens", "miami") for i in range(2)
     )
     assert all(key.startswith(line.split("_")[0]) for line in lines for key in line.split()) and len(lines) == 4
+
+
+def test_what_fails_on_one_rank_ends_both_alike(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The model or a set that only rank 1 cannot read, a list of sets that is shorter there, a full disk on rank 0."""
+    from accelerate import Accelerator
+
+    import jobs.evaluate as job
+    from pipeline.evaluation import predictions
+    from pipeline.evaluation.sets import load
+    from pipeline.model.weights import load as weights
+
+    asked = {"groups": ("single",), "sets": ("aisle", "aisle"), "root": str(run_folder / "data"), "workers": 0}
+    config = EvaluationConfig(**asked, recalls=(1,))
+    read_sets, write_all = load.load_sets, predictions.save_results
+
+    def broken(*_: object) -> None:
+        raise DataError("this disk is broken")
+
+    def fewer(*arguments: object) -> object:
+        sets, left_out = read_sets(*arguments)  # type: ignore[arg-type]
+        return sets[:1], left_out
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    faults = {
+        "model": (1, weights, "load_any", broken, "rank 1: this disk is broken"),
+        "sets": (1, load, "load_sets", broken, "rank 1: this disk is broken"),
+        "fewer sets": (1, load, "load_sets", fewer, "rank 1: the list of sets is aisle here and aisle, aisle on rank"),
+        "full disk": (0, predictions, "save_results", full, f"rank 0: writing the results into {run_folder}"),
+    }
+
+    def ends() -> list[str]:
+        found = []
+        for where, module, name, fault, _ in faults.values():
+            whole = getattr(module, name)
+            if rank() == where:
+                setattr(module, name, fault)
+            try:
+                words = job.EvaluateJob(checkpoint=str(run_folder / "run"), output=str(run_folder / "alike"), **asked)
+                job.run(words, config, Accelerator(cpu=True))
+                found.append("no error")
+            except UserError as error:
+                found.append(f"{error.exit_code} {error}")
+            setattr(module, name, whole)
+        return found
+
+    for name, value in {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500", "LOCAL_WORLD_SIZE": "2"}.items():
+        monkeypatch.setenv(name, value)
+    zero, one = run_ranks(ends, 2)
+    for (name, (_, _, _, _, wanted)), first, second in zip(faults.items(), zero, one, strict=True):
+        print(f"{name}: {first}")
+        assert first == second and first.startswith("2 " if name == "fewer sets" else "3 ") and wanted in first
+    assert predictions.save_results is write_all
