@@ -52,8 +52,8 @@ def locked(path: Path, refusal: str = "", patience: float = 0.0) -> Iterator[Non
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Errors of writing inside name the file: the system's (a full disk is told when bytes are written, and then names
-    none), and those of libraries, which become `DataError`."""
+    """Errors of writing inside are `OSError` and name the file: the system's (a full disk is told when bytes are
+    written, and then names none), and those that libraries made of it."""
     try:
         yield
     except OSError as error:
@@ -61,9 +61,9 @@ def naming(path: Path) -> Iterator[None]:
             error.filename = str(path)
         raise
     except Exception as error:
-        if isinstance(error, UserError) or (mended := told(error, str(path))) is None:
+        if isinstance(error, UserError) or (mended := told(error)) is None:
             raise
-        raise mended from error
+        raise OSError(errno.EIO, str(mended), str(path)) from error
 
 
 def write_atomically(path: Path, data: bytes | str, temporary: Path | None = None) -> None:

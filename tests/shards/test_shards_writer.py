@@ -330,7 +330,7 @@ def test_finished_groups_are_kept_only_while_their_shards_are_whole(
         return write(task)
 
     monkeypatch.setattr(groups, "write_group", stop_early)
-    with pytest.raises(UsageError, match=r"No space left.*same command"):
+    with pytest.raises(DataError, match=r"No space left.*same command"):
         write_shards(read_source(source), out, rule)
     monkeypatch.undo()
     assert len(list(out.glob("round-00-*.tar"))) == 3 and not (out / schema.MANIFEST).exists()

@@ -55,13 +55,17 @@ class JobProcess:
 
     def kill_when(self, ready: object, number: int = signal.SIGKILL, timeout: float = 120.0) -> None:
         """Sends a signal as soon as `ready()` is true."""
+        self.until(ready, timeout)
+        self.send(number)
+
+    def until(self, ready: object, timeout: float = 120.0) -> None:
+        """Waits until `ready()` is true."""
         assert callable(ready)
         deadline = time.monotonic() + timeout
         while not ready():
             assert self.alive(), f"it ended by itself:\n{self.text()[-3000:]}"
             assert time.monotonic() < deadline, self.text()[-3000:]
             time.sleep(0.002)
-        self.send(number)
 
 
 def _run(module: str, arguments: list[str], output: Path, environment: dict[str, str]) -> None:

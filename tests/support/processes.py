@@ -28,6 +28,14 @@ def free_port() -> int:
             return port
 
 
+def alive(pid: int) -> bool:
+    """Whether a process runs (one that waits to be reaped does not)."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 def run_ranks(function: Callable[..., Any], world: int, *arguments: Any, timeout: float = 120.0) -> list[Any]:
     """Calls `function(*arguments)` on `world` ranks of a gloo group; returns what each returned (torch-saveable).
 

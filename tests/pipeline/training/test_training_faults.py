@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +28,15 @@ import yaml
 from full_disk import small_files
 from job_process import JobProcess
 from launched import Launched
-from processes import run_ranks
+from processes import alive, run_ranks
 from safetensors.torch import load_file
 from tiny import prepare, run_settings
+from tiny_checkpoint import save_tiny
 
 from pipeline.common.errors import UsageError, UserError
 from pipeline.config import EvaluationConfig, ModelConfig, RunConfig, from_dict
 from pipeline.distributed import rank
+from pipeline.evaluation.describe import encode
 from pipeline.training import checkpoint
 from pipeline.training.launch import asked_processes, stop_signals
 from pipeline.training.records import run_folder
@@ -188,7 +191,6 @@ def test_faults_of_an_evaluation_end_both_alike(root: Path, tmp_path: Path) -> N
     broken.write_bytes(broken.read_bytes()[:200])
 
     def faults() -> dict[str, tuple[int, str, float]]:
-        from pipeline.evaluation.describe import encode
         from pipeline.evaluation.evaluate import evaluate
         from pipeline.evaluation.sets.load import load_set
         from pipeline.model.vpr import build_model
@@ -220,7 +222,8 @@ def test_faults_of_an_evaluation_end_both_alike(root: Path, tmp_path: Path) -> N
         print(f"evaluation, {name}: codes [{code}, {one[name][0]}], {max(seconds, one[name][2]):.2f} s: {message}")
         assert one[name][:2] == (code, message)
     assert [zero[name][0] for name in ("store", "regions", "photo", "none")] == [3, 3, 3, 0]
-    assert zero["store"][1].startswith(f"rank 0: {tmp_path}/store/descriptors/") and "too large" in zero["store"][1]
+    assert zero["store"][1].startswith("rank 0: evaluation database: ") and "too large" in zero["store"][1]
+    assert f" {tmp_path}/store/descriptors/" in zero["store"][1]
     assert not list((tmp_path / "store").rglob("*.partial"))
     assert zero["regions"][1].startswith("rank 1: ") and "regions.1.bin" in zero["regions"][1]
     assert broken.name in zero["photo"][1]
@@ -374,14 +377,6 @@ def test_ranks_do_not_train_on_without_their_launcher(root: Path) -> None:
     assert checkpoint.pointed(run, "last") is not None
 
 
-def alive(pid: int) -> bool:
-    """Whether a process runs (one that waits to be reaped does not)."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 SMALL_SHM = """
 import sys
 from pathlib import Path
@@ -457,17 +452,30 @@ def test_without_symbolic_links_last_and_best_are_text(
 
 
 def test_two_evaluations_in_one_folder(root: Path, tmp_path: Path) -> None:
-    from pipeline.common.files import locked
-    from pipeline.evaluation.evaluate import evaluate
-    from pipeline.model.vpr import build_model
+    """Each on two processes, with a store: the second is refused in one line, and the first never knows of it."""
+    run, out = save_tiny(tmp_path / "run", 0), tmp_path / "out"
+    words = ["--checkpoint", str(run), "--sets", str(root / "evaluation"), "--split", "val", "--groups", "single"]
+    words += ["--store", "fp32", "--figures", "false", "--track", "false", "--workers", "0", "--output", str(out)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(encode, "encode_batch", partial(held, tmp_path / "go", encode.encode_batch))
+        first = Launched("ddp", 2, "jobs.evaluate", words, tmp_path / "first")  # forked: its work waits for "go"
+    first.ranks[0].until(lambda: (out / ".lock").exists())
+    start = time.monotonic()
+    second = Launched("ddp", 2, "jobs.evaluate", words, tmp_path / "second")
+    codes = second.wait()
+    print(f"second evaluation in a folder: codes {codes}, {time.monotonic() - start:.1f} s from the start")
+    assert codes == [2, 2]
+    (line,) = [line for rank in second.ranks for line in rank.text().splitlines() if line.startswith("jobs.evaluate:")]
+    assert line.endswith(f"{out}: another evaluation works in it; wait for that, or give another --output")
+    (tmp_path / "go").touch()
+    first.done()
+    assert (out / "results.json").exists()
 
-    model = build_model(from_dict(ModelConfig, run_settings(root)["model"]), 28)
-    with (
-        locked(tmp_path / ".lock", "x"),
-        pytest.raises(UsageError, match=f"{tmp_path}: another evaluation works in it"),
-    ):
-        evaluate(model, [], EvaluationConfig(), "cpu", tmp_path)
-    assert evaluate(model, [], EvaluationConfig(), "cpu", tmp_path) == [], "the lock went with its holder"
+
+def held(until: Path, work: Callable[..., Any], *arguments: Any) -> Any:
+    while not until.exists():
+        time.sleep(0.01)
+    return work(*arguments)
 
 
 def test_what_a_launcher_was_asked_for() -> None:

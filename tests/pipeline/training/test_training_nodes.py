@@ -14,7 +14,7 @@ import pytest
 import torch
 import yaml
 from launched import Launched
-from processes import free_port
+from processes import alive, free_port
 from safetensors.torch import load_file
 from tiny import prepare, run_settings
 
@@ -85,6 +85,44 @@ def test_a_rank_that_dies_on_one_machine_ends_both_and_is_named(root: Path, tmp_
     told = (tmp_path / "machine1.log").read_text()
     assert "rank      : 1 (local_rank: 0)" in told
     assert "exitcode  : -9" in told
+
+
+def below(pid: int) -> list[int]:
+    """A process's children, theirs, and so on: ranks, fork servers, loader workers."""
+    listed = subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True).stdout.split()
+    return [found for child in map(int, listed) for found in (child, *below(child))]
+
+
+@pytest.mark.slow
+def test_a_killed_launcher_leaves_no_rank_and_its_run_is_continued(root: Path, tmp_path: Path) -> None:
+    """`accelerate launch` itself gets the SIGKILL; its ranks save and end, and the same command goes on at once."""
+    path = settings(root, "launcher", epochs=1000, save_every=1000)
+    options = ["--config_file", "jobs/accelerate/cpu.yaml", "-m", "jobs.train", "--config", str(path)]
+    command, log = [*LAUNCHER, *options, "--data.workers", "1"], root / "outputs/launcher/samples.rank1.jsonl"
+    with (tmp_path / "first").open("w") as said:
+        process = subprocess.Popen(command, env=ENVIRONMENT, stdout=said, stderr=said)
+        deadline = time.monotonic() + 200
+        while not (log.exists() and '"step": 3,' in log.read_text()):
+            assert process.poll() is None and time.monotonic() < deadline, (tmp_path / "first").read_text()[-3000:]
+            time.sleep(0.05)
+        started = below(process.pid)
+        process.kill()
+    killed = time.monotonic()
+    process.wait()
+    steps = len(log.read_text().splitlines()) + 5
+    again = subprocess.Popen(
+        [*command, "--train.steps", str(steps)], env=ENVIRONMENT, stderr=subprocess.PIPE, text=True
+    )
+    while (left := [pid for pid in started if alive(pid)]) and time.monotonic() < killed + 60:
+        time.sleep(0.05)
+    print(f"accelerate launch killed: {len(started)} processes below it gone after {time.monotonic() - killed:.1f} s")
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    said_again = again.communicate(timeout=200)[1]
+    assert not left and len(started) >= 4
+    assert again.returncode == 0, said_again[-3000:]
+    taken = [int(line.split('"step": ')[1].split(",")[0]) for line in log.read_text().splitlines()]
+    assert taken == list(range(1, max(taken) + 1)), "no step lost or repeated"
 
 
 def test_a_rank_that_dies_ends_the_others_at_once(root: Path) -> None:
