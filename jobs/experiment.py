@@ -3,10 +3,12 @@
     python -m jobs.experiment --table ablation_crica --config jobs/configs/paper.yaml --root data --seeds 0,1,2
     python -m jobs.experiment --table kernels --config jobs/configs/paper.yaml --dry_run
     python -m jobs.experiment --table spm --launch "accelerate launch --config_file jobs/accelerate/ddp.yaml"
+    python -m jobs.experiment --table sota --released weights/released --root data
 
 The configuration gives sizes and data; each row changes the settings that the paper's table varies. The same command
 continues a killed run.
-Writes `<output>/tables/<table>/table.{md,csv,png}`.
+The comparisons `sota` and `challenging` train nothing: they evaluate the released files in a folder, as far as they
+are there. Writes `<output>/tables/<table>/table.{md,csv,png}`; a comparison has no picture.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ class ExperimentJob(RunConfig):
 
     table: str = ""
     """ablation_crica, ablation_adaptation, dimensions, epochs, encoder_layers, train_batch, inference_batch, kernels,
-    spm, same_data, or parts, mined, one_photo (ours; the last two with paired intervals between rows)."""
+    spm, same_data, sota, challenging, or parts, mined, one_photo (ours; the last two with intervals between rows)."""
     rows: tuple[str, ...] = ()
     """Rows to fill, for example '[group, joint]'; none: all of the table."""
     seeds: tuple[int, ...] = (0,)
@@ -46,7 +48,11 @@ class ExperimentJob(RunConfig):
     resnet_weights: str | None = None
     """same_data: ImageNet weights of ResNet-50 for NetVLAD, CosPlace, GeM and MixVPR; none: random weights."""
     images_per_second: float | None = None
-    """Training speed, for the time estimate of --dry_run; none: the speed of recorded runs of the same rows."""
+    """Training speed, for the time estimate of --dry_run; none: the speed of recorded runs of the same rows. sota,
+    challenging: images described in a second."""
+    released: str = ""
+    """sota, challenging: folder of released files. What a file is, its tensors say; its name, whether it is CosPlace
+    or EigenPlaces, and whether it was trained on MSLS (msls, mapillary) or Pitts30k (pitts)."""
     dry_run: bool = False
     """Only print rows, trainings, sets, their cost and what is missing."""
     measure: str = ""
@@ -61,6 +67,9 @@ def main() -> None:
         return
     if not job.table:
         raise UsageError("--table is missing, for example --table ablation_crica")
+    if job.table in ("sota", "challenging"):
+        compare(job)
+        return
     from pipeline.paper.rows import table, with_rows
 
     wanted_table = with_rows(table(job.table), job.rows) if job.rows else table(job.table)
@@ -85,6 +94,31 @@ def main() -> None:
     table_report.write(filled, compared, folder)
     table_report.show(filled, compared)
     print(f"\nwritten to {folder}/: table.md, table.csv, table.png")
+
+
+def compare(job: ExperimentJob) -> None:
+    """A comparison over released files: evaluates, prints and writes it."""
+    if not job.released:
+        raise UsageError(f"--table {job.table} needs --released, the folder of the released files")
+    if not Path(job.released).is_dir():
+        raise UsageError(f"--released {job.released}: there is no such folder")
+    from pipeline.paper import released_table
+    from pipeline.paper.runner import Runner
+
+    wanted = dataclasses.replace(job.evaluate, sets=job.sets, root=job.root)
+    filled = released_table.build(job.table, Path(job.released), wanted, Runner(Path(job.output), job.launch), job.rows)
+    if job.dry_run:
+        print(released_table.costs(filled, job.images_per_second))
+        return
+    for line in filled.missing:
+        print(f"missing: {line}", file=sys.stderr)
+    if not filled.cells:
+        raise DataError(f"nothing of the table can be evaluated: {'; '.join(filled.missing)}")
+    filled.fill()
+    folder = Path(job.output) / "tables" / job.table
+    released_table.write(filled, folder)
+    released_table.show(filled)
+    print(f"\nwritten to {folder}/: table.md, table.csv, results/")
 
 
 def measure(order: Path, timeout: float) -> None:

@@ -68,6 +68,7 @@ SMALL = {
     "jobs.locate": "--workers 0",
     "jobs.experiment": "--output tables --data.places_per_batch 4 --train.steps 1 --tracking.enabled false "
     "--evaluate.workers 0",
+    "jobs.experiment released": "--output tables --tracking.enabled false --evaluate.workers 0 --sets pitts30k",
     "jobs.mine": "--workers 0",
     "jobs.benchmark mine": "--places 300 --dim 8 --places_per_batch 8",
     "jobs.benchmark step": "--size tiny --full false --device cpu",
@@ -91,6 +92,7 @@ SLOW = (
     "python -m jobs.train --config jobs/configs/cricavpr.yaml --train.passes joint",
     "python -m jobs.evaluate --checkpoint outputs/cricavpr --groups single,bank",
     "python -m jobs.experiment --table one_photo",
+    "python -m jobs.experiment --table sota --released weights/released --root data",
     "OMP_NUM_THREADS=1 python -m jobs.experiment",
     "python -m jobs.experiment --table ablation_crica --config jobs/configs/paper.yaml --root data --seeds",
 )  # fmt: skip
@@ -123,7 +125,7 @@ class Shown:
         kind = words[at + 1] + (f" {words[at + 2]}" if words[at + 1] == "jobs.benchmark" else "")
         for option, what in (("--verify", " verify"), ("--from_store", " store"), ("--pca", " pca"),
                              ("--rerank_by", " by"), ("--rerank", " rerank"),
-                             ("--street_places", " streets")):  # fmt: skip
+                             ("--released", " released"), ("--street_places", " streets")):  # fmt: skip
             kind += what if option in words and kind + what in SMALL else ""
         return words + shlex.split(SMALL[kind].format(number=COMMANDS.index(self)))
 
@@ -210,6 +212,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     for name, model in (("patch_netvlad", netvlad()), ("transvpr", transvpr())):
         save_model(model, world / "weights" / f"{name}.safetensors", model.config, model.image_size, everything=True)
+    released = world / "weights" / "released"
+    released.mkdir()
+    (released / "transvpr_pitts30k.safetensors").symlink_to(world / "weights" / "transvpr.safetensors")
     return world
 
 

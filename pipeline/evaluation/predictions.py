@@ -53,7 +53,10 @@ def predictions_path(folder: Path, set_name: str, protocol: Protocol) -> Path:
 
 
 def save_predictions(result: Result, evaluated: EvaluationSet, folder: Path) -> Path:
-    """Writes a result's predictions, whole or not at all; returns the file."""
+    """Writes a result's predictions, whole or not at all; returns the file.
+
+    MSLS-challenge also gets the file that its server takes.
+    """
     about = {"set": result.set_name, "protocol": result.protocol.to_dict(), "database": result.database}
     table = pa.table(
         {
@@ -67,22 +70,22 @@ def save_predictions(result: Result, evaluated: EvaluationSet, folder: Path) -> 
     path = predictions_path(folder, result.set_name, result.protocol)
     with replacing(path) as fresh:
         pq.write_table(table, fresh, compression="zstd")
+    if evaluated.name == "msls_challenge":
+        export_predictions(evaluated, result.predictions, path.with_suffix(".txt"))
     return path
 
 
 def save_results(results: Sequence[Result], sets: Sequence[EvaluationSet], output: Path, about: dict[str, Any]) -> None:
     """All that an evaluation leaves but pictures: results.json, results.csv, results.md, and predictions/.
 
-    MSLS-challenge also gets the file that its server takes. `about`: what results.json says of the model.
+    `about`: what results.json says of the model.
     """
     tables.write_json(results, output / "results.json", about)
     tables.write_csv(results, output / "results.csv")
     write_atomically(output / "results.md", tables.markdown(results))
     for result in results:
         evaluated = next(s for s in sets if s.name == result.set_name)
-        kept = save_predictions(result, evaluated, output / "predictions")
-        if evaluated.name == "msls_challenge":
-            export_predictions(evaluated, result.predictions, kept.with_suffix(".txt"))
+        save_predictions(result, evaluated, output / "predictions")
 
 
 def load_predictions(path: Path) -> Predictions:

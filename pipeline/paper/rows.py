@@ -218,7 +218,7 @@ def table(name: str) -> Table:
         return TABLES[name]
     near = difflib.get_close_matches(name, TABLES, n=1, cutoff=0.5)
     hint = f"did you mean '{near[0]}'? " if near else ""
-    raise UsageError(f"unknown table '{name}'; {hint}known: {', '.join(TABLES)}")
+    raise UsageError(f"unknown table '{name}'; {hint}known: {', '.join(TABLES)}, sota, challenging")
 
 
 def with_rows(whole: Table, names: Sequence[str]) -> Table:

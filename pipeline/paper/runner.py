@@ -25,7 +25,7 @@ from pipeline.common.files import write_atomically
 from pipeline.config import recorded
 from pipeline.evaluation.protocol import Protocol, read_protocol
 from pipeline.evaluation.report import tables
-from pipeline.paper.measure import results_file, write_order
+from pipeline.paper.measure import folder, results_file, write_order
 from pipeline.paper.plan import Cell, Training
 from pipeline.training.records.tracking import store_uri
 
@@ -106,9 +106,15 @@ class Runner:
         missing = [cell for cell in cells if not results_file(self.run_folder(training), cell).is_file()]
         if not missing:
             return
-        code = self._start("jobs.experiment", "--measure", str(write_order(self.run_folder(training), missing)))
+        run = self.run_folder(training)
+        order = write_order(folder(run), run, {cell.key: cell.config for cell in missing}, run)
+        self.carry_out(order, f"the evaluation of {training.name}")
+
+    def carry_out(self, order: Path, what: str) -> None:
+        """The evaluations of `write_order`. Raises `Preempted` or `StepFailed`, which says `what` failed."""
+        code = self._start("jobs.experiment", "--measure", str(order))
         if code:
-            raise StepFailed(f"the evaluation of {training.name}", code)
+            raise StepFailed(what, code)
 
     def results(self, cell: Cell) -> Recalls | None:
         """An evaluation's recalls from disk, None where it has not been done."""
