@@ -1,6 +1,6 @@
 """The paper's comparisons with other methods, filled from released files: `sota` and `challenging`.
 
-    python -m jobs.experiment --table sota --released weights/released --root data --dry_run
+    python -m jobs.experiment --table sota --dry_run --released weights/released --root data
 
 Invariant: what a file is follows from its tensors, as everywhere; its name only says what no tensor does (which of
 CosPlace and EigenPlaces it is, which data it was trained on). A figure of the paper stands beside ours on the same set
