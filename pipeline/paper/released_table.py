@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.common.errors import DataError, UsageError
+from pipeline.common.files import write_atomically
 from pipeline.common.text import Table, csv_text, markdown_text, printable
 from pipeline.config import EvaluationConfig, ModelConfig, flatten
 from pipeline.config.setting import changing
@@ -160,7 +161,6 @@ class ReleasedTable:
         for path in dict.fromkeys(cell.release.path for cell in self.cells):
             todo = [cell for cell in self.cells if cell.release.path == path and self.result(cell) is None]
             if todo:
-                self.results.mkdir(parents=True, exist_ok=True)
                 evaluations = {cell.name: cell.config for cell in todo}
                 order = write_order(self.results, path, evaluations)
                 self.runner.carry_out(order, f"the evaluation of {path.name}")
@@ -370,12 +370,12 @@ def show(table: ReleasedTable) -> None:
 
 def write(table: ReleasedTable, folder: Path) -> None:
     """`table.md`, and `table.csv` with one line a method, set and N, in `folder`."""
-    folder.mkdir(parents=True, exist_ok=True)
     out = [f"# {table.comparison.title}", ""]
     for set_name in table.sets:
         out += [markdown_text(heading(table, set_name)), "", set_table(table, set_name).markdown()]
-    (folder / "table.md").write_text("\n".join([*out, *(f"- {markdown_text(note)}" for note in notes(table))]) + "\n")
-    (folder / "table.csv").write_text(csv_text(_long_form(table)))
+    out += [f"- {markdown_text(note)}" for note in notes(table)]
+    write_atomically(folder / "table.md", "\n".join(out) + "\n")
+    write_atomically(folder / "table.csv", csv_text(_long_form(table)))
 
 
 def _long_form(table: ReleasedTable) -> Iterator[list[object]]:

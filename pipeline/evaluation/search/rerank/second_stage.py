@@ -115,14 +115,14 @@ def rerank(
     rows, kept = predictions.copy(), distances.copy()
     rows[:, :first] = np.take_along_axis(predictions[:, :first], order, 1)
     kept[:, :first] = np.take_along_axis(distances[:, :first], order, 1)
-    return rows, kept, _told(costs, len(predictions), first)
+    return rows, kept, _told(costs, len(predictions), min(first, len(evaluated.database)))
 
 
-def _told(costs: np.ndarray, queries: int, first: int) -> str:
+def _told(costs: np.ndarray, queries: int, candidates: int) -> str:
     """`costs`: [W, 3] of seconds, seconds of describing, bytes a photo."""
     each, describing = (f"{costs[:, column].sum() / max(queries, 1):,.3f} s" for column in (0, 1))
     size = costs[:, 2].max() / 1e6
     return (
         f"re-ranking takes {each} a query on one process ({describing} to read and describe photos not yet described) "
-        f"and {size * (1 + first):,.1f} MB for it and its candidates ({size:,.2f} MB a photo)"
+        f"and {size * (1 + candidates):,.1f} MB for it and its candidates ({size:,.2f} MB a photo)"
     )
