@@ -63,7 +63,7 @@ SMALL = {
     "jobs.evaluate": "--workers 0 --figures false --track false --group_size 4",
     "jobs.evaluate rerank": "--workers 0 --figures false --track false --rerank_layer 1",
     "jobs.evaluate by": "--workers 0 --figures false --track false --rerank 4",
-    "jobs.evaluate store": "--dimensions 8,4",
+    "jobs.evaluate store": "--dimensions 8,4 --prefixes 8",
     "jobs.compare": "",
     "jobs.locate": "--workers 0",
     "jobs.experiment": "--output tables --data.places_per_batch 4 --train.steps 1 --tracking.enabled false "

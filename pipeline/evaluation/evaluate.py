@@ -292,8 +292,7 @@ def answer_queries(
             exact.append(search(asked[inside], database(), k)[1])
             near.append(found[numbers[inside]])
     share = agreement(np.concatenate(near), np.concatenate(exact))
-    what = protocol.search + (f", refined among {protocol.refine}," if protocol.refine else "")
-    remark = f"{what} finds {share:.1f} % of the exact {k} neighbours ({len(sample):,} queries), index"
+    remark = f"{protocol.name} finds {share:.1f} % of the exact {k} neighbours ({len(sample):,} queries), index"
     cost = SearchCost(*bytes_each(index), 1e3 * clock.seconds / len(found))
     return Answers(found, distances, (f"{remark} {index_bytes(index) / 1e6:,.1f} MB",), cost)
 

@@ -193,7 +193,7 @@ def test_recalls_and_pca_tables_come_from_the_store_alone(tmp_path: Path) -> Non
 def test_an_approximate_search_says_how_well_it_agrees(tmp_path: Path, search: str) -> None:
     config = dataclasses.replace(CONFIG, groups=("single",), search=search)  # type: ignore[arg-type]
     result = evaluate(Tiny(), [make_set(tmp_path)], config, "cpu", progress=False)[0]
-    assert f"{search} finds " in result.remarks[0] and result.protocol.name == f"single_16px_pairs_{search}"
+    assert f"_{search} finds " in result.remarks[0] and result.protocol.name == f"single_16px_pairs_{search}"
 
 
 def run_rank(rank: int, world: int, folder: Path, evaluated: EvaluationSet, broken: bool) -> None:
