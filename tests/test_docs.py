@@ -1,7 +1,8 @@
 """What the documents show a person works: every shown command is run, and their links and files are there.
 
-Commands run as they are typed, with the number of processes shown, in a folder where the shown paths hold small made
-material; options that make the work small are put behind them (`SMALL`). A page's commands run in their order, so that
+Commands run with the number of processes shown, in a folder where the shown paths hold small made material; options
+that make the work small are put behind them (`SMALL`). The first `accelerate launch` runs as it is typed, later ones as
+the processes it would start, forked from this one. A page's commands run in their order, so that
 a later one finds what an earlier one made. One that was run for an earlier page is not run again.
 """
 
@@ -20,6 +21,7 @@ from typing import Any
 import pytest
 import yaml
 from job_process import JobProcess
+from launched import Launched
 from tiny import make_evaluation, make_gsv, photo, run_settings
 from tiny_matchers import netvlad, transvpr
 
@@ -232,15 +234,19 @@ def run(words: list[str], world: Path) -> str:
     return job.text()
 
 
+def run_launched(words: list[str], world: Path) -> None:
+    """What `accelerate launch WORDS` starts, without importing everything again in each process."""
+    at = words.index("-m")
+    options = dict(zip(words[:at:2], words[1:at:2], strict=True))
+    asked = options.get("--num_processes", yaml.safe_load(Path(options["--config_file"]).read_text())["num_processes"])
+    Launched("ddp", int(asked), words[at + 1], words[at + 2 :], world / "log").done(900)
+
+
 def run_as_typed(words: list[str], world: Path) -> None:
     """The whole command line, with its launcher, in a process group of its own."""
-    settings = {}
-    while "=" in words[0]:
-        name, _, value = words.pop(0).partition("=")
-        settings[name] = value
     program = shutil.which(words[0], path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     assert program is not None, words[0]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), **settings}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [program, *words[1:]], cwd=world, env=environment, capture_output=True, text=True, timeout=1200
     )
@@ -258,12 +264,16 @@ def run_all(commands: list[Shown], world: Path, monkeypatch: pytest.MonkeyPatch)
     for command in commands:
         if command.text in DONE:
             continue
-        DONE.add(command.text)
         words = command.words
+        while "=" in words[0]:
+            monkeypatch.setenv(*words.pop(0).split("=", 1))
         if words[:2] == ["python", "-m"]:
             run(words[2:], world)
+        elif any(done.startswith("accelerate launch") for done in DONE):
+            run_launched(words[2:], world)
         else:
             run_as_typed(words, world)
+        DONE.add(command.text)
 
 
 def to_run(slow: bool) -> dict[str, list[Shown]]:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from job_process import JobProcess
+from launched import Launched
 from PIL import Image
 from processes import run_ranks
 
@@ -28,8 +25,6 @@ from pipeline.config import (
 from pipeline.distributed import rank
 from pipeline.model.vpr import build_model
 from pipeline.model.weights.files import save_model
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -60,22 +55,22 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def start(folder: Path, *options: str, processes: int = 1) -> subprocess.CompletedProcess[str]:
-    launcher = ["-m", "torch.distributed.run", "--nproc_per_node", str(processes)] if processes > 1 else []
-    command = [sys.executable, *launcher, "-m", "jobs.evaluate", "--root", str(folder / "data"), "--workers", "0"]
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "ACCELERATE_USE_CPU": "1"}
-    return subprocess.run([*command, *options], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=240)
+def start(folder: Path, *options: str, processes: int = 1, code: int = 0) -> str:
+    """What rank 0 printed."""
+    words = ["--root", str(folder / "data"), "--workers", "0", *options]
+    job = Launched("ddp", processes, "jobs.evaluate", words, folder / "log")
+    assert job.wait() == [code] * processes, "\n".join(rank.text() for rank in job.ranks)
+    return job.ranks[0].text()
 
 
 def test_one_process_and_two_write_the_same_figures(run_folder: Path) -> None:
     common = ("--checkpoint", str(run_folder / "run"), "--group-size", "4", "--recalls", "1,5")
-    alone = start(
+    told = start(
         run_folder, *common, "--sets", "aisle,pitts30k", "--pca", "6", "--pca-from", "aisle", "--store", "fp32"
     )
-    assert alone.returncode == 0, alone.stderr
-    assert "left out: pitts30k" in alone.stderr
+    assert "left out: pitts30k" in told
     assert all(
-        name in alone.stdout
+        name in told
         for name in (
             "single_pca6_from-aisle_56px",
             "shuffled4_pca6_from-aisle_56px",
@@ -94,8 +89,7 @@ def test_one_process_and_two_write_the_same_figures(run_folder: Path) -> None:
     changed = [f.stat().st_mtime_ns for f in kept]
 
     options = ("--pca", "6", "--pca-from", "aisle", "--output", str(run_folder / "two"), "--figures", "false")
-    two = start(run_folder, *common, "--sets", "aisle", *options, processes=2)
-    assert two.returncode == 0, two.stderr
+    start(run_folder, *common, "--sets", "aisle", *options, processes=2)
     assert [f.stat().st_mtime_ns for f in kept] == changed  # read, not fitted again
     again = json.loads((run_folder / "two" / "results.json").read_text())["results"]
     assert [r["recalls"] for r in again] == [r["recalls"] for r in results["results"]]
@@ -107,11 +101,9 @@ def test_one_process_and_two_write_the_same_figures(run_folder: Path) -> None:
 
 
 def test_what_is_missing_is_said_in_one_line(run_folder: Path) -> None:
-    nothing = start(run_folder, "--checkpoint", str(run_folder / "run"), "--sets", "pitts30k")
-    assert nothing.returncode == 3 and "pitts30k is not there" in nothing.stderr
-    assert "Traceback" not in nothing.stderr
-    unnamed = start(run_folder)
-    assert unnamed.returncode == 2 and "--checkpoint is missing" in unnamed.stderr
+    nothing = start(run_folder, "--checkpoint", str(run_folder / "run"), "--sets", "pitts30k", code=3)
+    assert "pitts30k is not there" in nothing and "Traceback" not in nothing
+    assert "--checkpoint is missing" in start(run_folder, code=2)
 
 
 def test_the_challenge_is_written_in_the_line_format_of_its_server(run_folder: Path) -> None:
@@ -128,10 +120,8 @@ def test_the_challenge_is_written_in_the_line_format_of_its_server(run_folder: P
             keys = "".join(f"{i},{city}_{side[0]}{i},True\n" for i in range(count))
             (base / "subtask_index.csv").write_text(",key,all\n" + keys)
     options = ["--checkpoint", str(run_folder / "run"), "--sets", "msls_challenge", "--root", str(root)]
-    options += ["--groups", "single", "--recalls", "1,2", "--workers", "0", "--output", str(run_folder / "challenge")]
-    job = JobProcess("jobs.evaluate", [*options, "--figures", "false"], run_folder / "challenge.log")
-    assert job.wait(240) == 0, job.text()
-    assert "single" in job.text()
+    options += ["--groups", "single", "--recalls", "1,2", "--output", str(run_folder / "challenge")]
+    assert "single" in start(run_folder, *options, "--figures", "false")
     (written,) = (run_folder / "challenge/predictions").glob("msls_challenge.single_56px*.txt")
     lines = written.read_text().splitlines()
     assert sorted(line.split()[:2] for line in lines) == sorted(

@@ -69,7 +69,7 @@ def training_model(state: dict[str, Tensor], start: str) -> PlaceModel:
     ("start", "steps"),
     [
         ("recipe", 1),
-        ("officialinit", 1),
+        pytest.param("officialinit", 1, marks=pytest.mark.slow),
         pytest.param("recipe", 3, marks=pytest.mark.slow),
         pytest.param("officialinit", 3, marks=pytest.mark.slow),
     ],

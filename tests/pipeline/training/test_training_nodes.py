@@ -140,7 +140,7 @@ def test_a_rank_that_dies_ends_the_others_at_once(root: Path) -> None:
 
 
 def test_a_frozen_rank_ends_the_others_within_the_timeout(root: Path) -> None:
-    path = settings(root, "frozen", epochs=1000, timeout=12.0)
+    path = settings(root, "frozen", epochs=1000, timeout=6.0)
     job = Launched("ddp", 2, "jobs.train", ["--config", str(path)], root / "frozen.log")
     log = root / "outputs/frozen/samples.rank1.jsonl"
     job.ranks[1].kill_when(lambda: log.exists() and '"step": 2,' in log.read_text(), signal.SIGSTOP)

@@ -6,8 +6,7 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,11 @@ import pytest
 import torch
 import yaml
 from job_process import JobProcess
+from launched import Launched
 from safetensors.torch import load_file
 from tiny import prepare, run_settings, samples
+
+from pipeline.training.validation import Validation
 
 
 @pytest.fixture(scope="module")
@@ -42,25 +44,24 @@ def start(path: Path, *overrides: str) -> JobProcess:
     return JobProcess("jobs.train", ["--config", str(path), *overrides], path.with_suffix(".log"))
 
 
+def start_to_validate_slowly(path: Path) -> JobProcess:
+    """A run that a signal certainly finds in a validation, if it is sent at its beginning."""
+    run = Validation.run
+
+    def slowly(self: Validation, *given: Any) -> Any:
+        time.sleep(0.5)
+        return run(self, *given)
+
+    with pytest.MonkeyPatch.context() as patch:  # the forked job inherits it
+        patch.setattr(Validation, "run", slowly)
+        return start(path)
+
+
 def train(path: Path, *overrides: str, code: int = 0) -> str:
     """One process; its output."""
     job = start(path, *overrides)
     assert job.wait() == code, job.text()[-3000:]
     return job.text()
-
-
-def launch(path: Path, *overrides: str, processes: int = 1) -> None:
-    """Fresh interpreters, by the real launcher."""
-    launcher = [sys.executable, "-m", "accelerate.commands.accelerate_cli", "launch"]
-    if processes == 1:
-        launcher = [sys.executable]
-    else:
-        launcher += ["--config_file", "jobs/accelerate/cpu.yaml", "--num_processes", str(processes)]
-    done = subprocess.run(
-        [*launcher, "-m", "jobs.train", "--config", str(path), *overrides],
-        env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, timeout=240,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-3000:]
 
 
 def weights(root: Path, name: str, which: str = "last") -> dict[str, torch.Tensor]:
@@ -109,7 +110,7 @@ def test_elastic_two_processes_after_one(root: Path, whole: str) -> None:
     reference = config(root, "elastic-reference", model=yaml.safe_load(path.read_text())["model"])
     train(reference)
     kill_at(root, path, 5)
-    launch(path, processes=2)
+    Launched("ddp", 2, "jobs.train", ["--config", str(path)], path.with_suffix(".log")).done()
     assert samples(root, "elastic") == samples(root, "elastic-reference") == samples(root, whole)
     one, two = weights(root, "elastic-reference"), weights(root, "elastic")
     # float32 and Adam, which divides rounding by its own size: near, and far from the distance that training moved
@@ -139,7 +140,7 @@ def test_a_signal_saves_and_leaves_with_75(root: Path, whole: str, number: signa
 
 
 def test_workers_do_not_change_a_bit(root: Path, whole: str) -> None:
-    launch(config(root, "workers", data__workers=2))
+    train(config(root, "workers", data__workers=2))
     assert same_bits(weights(root, "workers"), weights(root, whole))
 
 
@@ -247,7 +248,7 @@ def test_without_validation_only_the_end_is_registered(root: Path) -> None:
 
 def test_a_signal_during_a_validation_is_answered_before_the_next_step(root: Path, whole: str) -> None:
     path = config(root, "signalled-validation")
-    job = start(path)
+    job = start_to_validate_slowly(path)
     state = root / "outputs" / path.stem / "checkpoints/last/state.json"
     job.kill_when(lambda: state.exists() and '"step": 6,' in state.read_text(), signal.SIGTERM, timeout=60)
     assert job.wait() == 75, job.text()
@@ -265,7 +266,7 @@ def test_a_kill_in_the_last_validation_does_not_lose_it(root: Path, whole: str, 
     train(path)
     finished = json.loads((root / "outputs" / name / "checkpoints/last/state.json").read_text())
     path = config(root, f"{name}-killed", **changes)
-    job = start(path)
+    job = start_to_validate_slowly(path)
     state = root / "outputs" / path.stem / "checkpoints/last/state.json"
     last = finished["state"]["step"]
     job.kill_when(lambda: state.exists() and f'"step": {last},' in state.read_text(), timeout=60)

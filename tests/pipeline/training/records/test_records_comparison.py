@@ -90,7 +90,10 @@ def test_what_is_missing_is_named(store: Path) -> None:
         comparison.load_runs(store_uri(None, str(store)), "nothing")
 
 
-def test_a_store_that_cannot_be_reached_is_an_error_at_the_start(tmp_path: Path) -> None:
+def test_a_store_that_cannot_be_reached_is_an_error_at_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")  # by default three, for 12 seconds
     config = RunConfig(output=str(tmp_path), tracking=TrackingConfig(uri="http://127.0.0.1:9"))
     with pytest.raises(UsageError, match=r"MLflow store http://127\.0\.0\.1:9 cannot be used"):
         Tracker(config)
