@@ -1,8 +1,8 @@
 """What the documents show a person works: every shown command is run, and their links and files are there.
 
-Commands run with the number of processes shown, in a folder where the shown paths hold small made material; options
-that make the work small are put behind them (`SMALL`). The first `accelerate launch` runs as it is typed, later ones as
-the processes it would start, forked from this one. A page's commands run in their order, so that
+Commands run as they are typed, in a folder where the shown paths hold small made material; options that make the work
+small are put behind them (`SMALL`). The first `accelerate launch` starts two processes; of later ones the processes
+that they would start are forked from this one, in the number shown. A page's commands run in their order, so that
 a later one finds what an earlier one made. One that was run for an earlier page is not run again.
 """
 
@@ -243,7 +243,9 @@ def run_launched(words: list[str], world: Path) -> None:
 
 
 def run_as_typed(words: list[str], world: Path) -> None:
-    """The whole command line, with its launcher, in a process group of its own."""
+    """The whole command line, with its launcher (of two processes), in a process group of its own."""
+    if "--num_processes" in words:
+        words[words.index("--num_processes") + 1] = "2"
     program = shutil.which(words[0], path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     assert program is not None, words[0]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}

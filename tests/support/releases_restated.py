@@ -1,14 +1,16 @@
-"""Other methods' released networks, restated: names and shapes of their state dicts, and their forward passes.
+"""CricaVPR, its loss and other methods' released networks, restated: names and shapes of their state dicts, and their
+forward passes.
 
-Written from the public sources named in pipeline/model/weights/released_layouts.py, in plain functional torch
-on a state dict; nothing
-of the project is used, so that its conversions are compared with something else than themselves.
+Written from the paper and from the public sources named in pipeline/model/weights/released_layouts.py, in plain
+functional torch on a state dict; nothing of the project is used, so that its model, loss and conversions are compared
+with something else than themselves.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -134,11 +136,11 @@ def linear_shapes(name: str, out: int, channels: int) -> Shape:
     return {f"{name}.weight": (out, channels), f"{name}.bias": (out,)}
 
 
-def dinov2_shapes(prefix: str, dim: int, depth: int, grid: int) -> Shape:
-    """A DINOv2 with heads of 64 and patches of 14."""
+def dinov2_shapes(prefix: str, dim: int, depth: int, grid: int, patch: int = 14) -> Shape:
+    """A released DINOv2."""
     shapes: Shape = {
         "cls_token": (1, 1, dim), "pos_embed": (1, 1 + grid * grid, dim), "mask_token": (1, dim),
-        "patch_embed.proj.weight": (dim, 3, 14, 14), "patch_embed.proj.bias": (dim,),
+        "patch_embed.proj.weight": (dim, 3, patch, patch), "patch_embed.proj.bias": (dim,),
         "norm.weight": (dim,), "norm.bias": (dim,),
     }  # fmt: skip
     for i in range(depth):
@@ -151,8 +153,13 @@ def dinov2_shapes(prefix: str, dim: int, depth: int, grid: int) -> Shape:
     return {prefix + name: shape for name, shape in shapes.items()}
 
 
-def dinov2(state: State, prefix: str, x: Tensor, final_norm: bool) -> tuple[Tensor, Tensor]:
-    """[b, 3, S, S] -> (patch map [b, D, S / 14, S / 14], class token [b, D])."""
+def dinov2(
+    state: State, prefix: str, x: Tensor, final_norm: bool, adapter: Callable[[str, Tensor], Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
+    """[b, 3, S, S] -> (patch map [b, D, S / 14, S / 14], class token [b, D]); heads of 64, patches of 14.
+
+    `adapter(name of the block, normed tokens)` is added to each block's MLP.
+    """
 
     def get(name: str) -> Tensor:
         return state[prefix + name]
@@ -172,7 +179,7 @@ def dinov2(state: State, prefix: str, x: Tensor, final_norm: bool) -> tuple[Tens
     positions = stored[:, 1:].reshape(1, grid, grid, dim).permute(0, 3, 1, 2)
     if grid != side:
         scale = (side + 0.1) / grid
-        positions = F.interpolate(positions, scale_factor=(scale, scale), mode="bicubic")
+        positions = F.interpolate(positions.float(), scale_factor=(scale, scale), mode="bicubic").to(x.dtype)
     x = torch.cat((get("cls_token").expand(b, 1, dim) + stored[:, :1], x + positions.flatten(2).transpose(1, 2)), 1)
     i = 0
     while f"{prefix}blocks.{i}.norm1.weight" in state:
@@ -181,12 +188,122 @@ def dinov2(state: State, prefix: str, x: Tensor, final_norm: bool) -> tuple[Tens
         scores = torch.einsum("bqhd,bkhd->bhqk", q, k) / 8
         mixed = torch.einsum("bhqk,bkhd->bqhd", scores.softmax(-1), v).flatten(2)
         x = x + get(f"{block}ls1.gamma") * linear(mixed, f"{block}attn.proj")
-        hidden = F.gelu(linear(norm(x, f"{block}norm2"), f"{block}mlp.fc1"))
-        x = x + get(f"{block}ls2.gamma") * linear(hidden, f"{block}mlp.fc2")
+        normed = norm(x, f"{block}norm2")
+        added = linear(F.gelu(linear(normed, f"{block}mlp.fc1")), f"{block}mlp.fc2")
+        if adapter is not None:
+            added = added + adapter(prefix + block, normed)
+        x = x + get(f"{block}ls2.gamma") * added
         i += 1
     if final_norm:
         x = norm(x, "norm")
     return x[:, 1:].transpose(1, 2).reshape(b, dim, side, side), x[:, 0]
+
+
+def cricavpr_shapes(dim: int, depth: int, grid: int, reduced: int, layers: int, feedforward: int) -> Shape:
+    """CricaVPR: DINOv2 with an adapter in every block, GeM's exponent, the cross-image encoder."""
+    shapes = dinov2_shapes("backbone.", dim, depth, grid)
+    width = dim // 2
+    for i in range(depth):
+        adapter = f"backbone.blocks.{i}.adapter"
+        shapes |= linear_shapes(f"{adapter}.D_fc1", width, dim) | linear_shapes(f"{adapter}.D_fc2", dim, width)
+        for name, conv in {
+            "branch1": (width // 2, width, 1, 1),
+            "branch2.0": (reduced, width, 1, 1), "branch2.1": (width // 4, reduced, 3, 3),
+            "branch3.0": (reduced, width, 1, 1), "branch3.1": (width // 4, reduced, 5, 5),
+        }.items():  # fmt: skip
+            shapes |= {f"{adapter}.{name}.conv.weight": conv, f"{adapter}.{name}.conv.bias": conv[:1]}
+            for part in ("weight", "bias", "running_mean", "running_var"):
+                shapes[f"{adapter}.{name}.bn.{part}"] = conv[:1]
+            shapes[f"{adapter}.{name}.bn.num_batches_tracked"] = ()
+    shapes["aggregation.1.p"] = (1,)
+    for i in range(layers):
+        layer = f"encoder.layers.{i}"
+        shapes |= {f"{layer}.self_attn.in_proj_weight": (3 * dim, dim), f"{layer}.self_attn.in_proj_bias": (3 * dim,)}
+        shapes |= linear_shapes(f"{layer}.self_attn.out_proj", dim, dim)
+        shapes |= linear_shapes(f"{layer}.linear1", feedforward, dim)
+        shapes |= linear_shapes(f"{layer}.linear2", dim, feedforward)
+        shapes |= {f"{layer}.{norm}.{part}": (dim,) for norm in ("norm1", "norm2") for part in ("weight", "bias")}
+    return shapes
+
+
+def mulconv(state: State, block: str, x: Tensor, train: bool) -> Tensor:
+    """CricaVPR's adapter (section 3.3), its factor 0.2 included: tokens [b, 1 + N, D] -> the same. Moves the running
+    statistics in `state` in training."""
+    name = f"{block}adapter."
+
+    def conv(x: Tensor, path: str) -> Tensor:
+        weight = state[f"{name}{path}.conv.weight"]
+        x = F.conv2d(x, weight, state[f"{name}{path}.conv.bias"], padding=weight.shape[-1] // 2)
+        mean, var, gain, bias = (
+            state[f"{name}{path}.bn.{p}"] for p in ("running_mean", "running_var", "weight", "bias")
+        )
+        if train:
+            own, spread = x.mean((0, 2, 3)), x.var((0, 2, 3))
+            mean.lerp_(own.detach(), 0.1)
+            var.lerp_(spread.detach(), 0.1)
+            mean, var = own, x.var((0, 2, 3), correction=0)
+        x = (x - mean.view(1, -1, 1, 1)) / (var + 1e-3).sqrt().view(1, -1, 1, 1)
+        return (x * gain.view(1, -1, 1, 1) + bias.view(1, -1, 1, 1)).relu()
+
+    hidden = (x @ state[f"{name}D_fc1.weight"].T + state[f"{name}D_fc1.bias"]).relu()
+    side = round((x.shape[1] - 1) ** 0.5)
+    grid = hidden[:, 1:].transpose(1, 2).unflatten(2, (side, side))
+    paths = [conv(grid, "branch1")] + [conv(conv(grid, f"branch{n}.0"), f"branch{n}.1") for n in (2, 3)]
+    patches = torch.cat(paths, 1).flatten(2).transpose(1, 2) + hidden[:, 1:]
+    mixed = torch.cat((2 * hidden[:, :1], patches), 1)
+    return 0.2 * (mixed @ state[f"{name}D_fc2.weight"].T + state[f"{name}D_fc2.bias"])
+
+
+def cricavpr(state: State, x: Tensor, heads: int, train: bool) -> Tensor:
+    """[B, 3, S, S] -> [B, 14 D] of unit length; no dropout."""
+    patches, token = dinov2(state, "backbone.", x, True, lambda block, tokens: mulconv(state, block, tokens, train))
+    patches, side = F.normalize(patches, dim=1), patches.shape[-1]
+    regions = [token]
+    for n in (2, 3):
+        edges = [int(i * side / n + 0.5) for i in range(n + 1)]
+        for top, bottom in pairwise(edges):
+            for left, right in pairwise(edges):
+                regions.append(gem(patches[:, :, top:bottom, left:right], state["aggregation.1.p"]))
+    related = [encoded(state, region, heads) for region in regions]
+    return F.normalize(torch.cat(related, 1), dim=1)
+
+
+def encoded(state: State, x: Tensor, heads: int) -> Tensor:
+    """The cross-image encoder on one region of all images, [B, D]: the images are the sequence."""
+    i = 0
+    while (layer := f"encoder.layers.{i}.") + "norm1.weight" in state:
+
+        def linear(x: Tensor, name: str, layer: str = layer) -> Tensor:
+            return x @ state[f"{layer}{name}.weight"].T + state[f"{layer}{name}.bias"]
+
+        def norm(x: Tensor, name: str, layer: str = layer) -> Tensor:
+            return F.layer_norm(x, x.shape[-1:], state[f"{layer}{name}.weight"], state[f"{layer}{name}.bias"])
+
+        qkv = x @ state[f"{layer}self_attn.in_proj_weight"].T + state[f"{layer}self_attn.in_proj_bias"]
+        q, k, v = (part.unflatten(1, (heads, -1)) for part in qkv.chunk(3, 1))
+        scores = torch.einsum("qhd,khd->hqk", q, k) / q.shape[-1] ** 0.5
+        mixed = torch.einsum("hqk,khd->qhd", scores.softmax(-1), v).flatten(1)
+        x = norm(x + linear(mixed, "self_attn.out_proj"), "norm1")
+        x, i = norm(x + linear(F.gelu(linear(x, "linear1")), "linear2"), "norm2"), i + 1
+    return x
+
+
+def multi_similarity(
+    x: Tensor, labels: list[int], ignored: Callable[[int, int], bool] = lambda place, other: False
+) -> Tensor:
+    """The Multi-Similarity loss with its mining, pair by pair: alpha 1, beta 50, lambda 0, margin 0.1, mean over all
+    anchors. `ignored(place, other place)`: their images are no negatives of each other."""
+    unit = F.normalize(x, dim=1)
+    total = x.new_zeros(())
+    for q, place in enumerate(labels):
+        s = unit @ unit[q]
+        same = [i for i, label in enumerate(labels) if label == place and i != q]
+        other = [i for i, label in enumerate(labels) if label != place and not ignored(place, label)]
+        hard, easy = max(s[i] for i in other), min(s[i] for i in same)
+        push = [torch.exp(-s[i]) for i in same if s[i] - 0.1 < hard]
+        pull = [torch.exp(50 * s[i]) for i in other if s[i] + 0.1 > easy]
+        total = total + torch.log1p(sum(push, x.new_zeros(()))) + torch.log1p(sum(pull, x.new_zeros(()))) / 50
+    return total / len(labels)
 
 
 def gem(x: Tensor, p: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Published weights made from names, at the paper's and at small sizes; written from the reference's own list."""
+"""Published weights made from names, at the paper's and at small sizes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from releases_restated import cricavpr_shapes, dinov2_shapes
 from torch import Tensor
 
 from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig
@@ -20,51 +21,6 @@ SMALL = ModelConfig(
     cross_image=CrossImageConfig(layers=2, heads=4, feedforward=48),
 )
 SMALL_IMAGE = 42  # 6 x 6 tokens
-
-
-def backbone_shapes(dim: int, depth: int, patch: int, grid: int, mlp: int) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a released DINOv2 state dict."""
-    shapes: dict[str, tuple[int, ...]] = {
-        "cls_token": (1, 1, dim), "pos_embed": (1, 1 + grid * grid, dim), "mask_token": (1, dim),
-        "patch_embed.proj.weight": (dim, 3, patch, patch), "patch_embed.proj.bias": (dim,),
-        "norm.weight": (dim,), "norm.bias": (dim,),
-    }  # fmt: skip
-    for i in range(depth):
-        for name, shape in {
-            "norm1": (dim,), "norm2": (dim,), "attn.qkv": (3 * dim, dim), "attn.proj": (dim, dim),
-            "mlp.fc1": (mlp, dim), "mlp.fc2": (dim, mlp),
-        }.items():  # fmt: skip
-            shapes[f"blocks.{i}.{name}.weight"] = shape
-            shapes[f"blocks.{i}.{name}.bias"] = shape[:1]
-        shapes[f"blocks.{i}.ls1.gamma"] = shapes[f"blocks.{i}.ls2.gamma"] = (dim,)
-    return shapes
-
-
-def published_shapes() -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the published CricaVPR state dict, from its description."""
-    shapes = {f"backbone.{n}": s for n, s in backbone_shapes(768, 12, 14, 37, 3072).items()}
-    for i in range(12):
-        adapter = f"backbone.blocks.{i}.adapter"
-        for name, shape in {"D_fc1": (384, 768), "D_fc2": (768, 384)}.items():
-            shapes |= {f"{adapter}.{name}.weight": shape, f"{adapter}.{name}.bias": shape[:1]}
-        for name, conv in {
-            "branch1": (192, 384, 1, 1), "branch2.0": (24, 384, 1, 1), "branch2.1": (96, 24, 3, 3),
-            "branch3.0": (24, 384, 1, 1), "branch3.1": (96, 24, 5, 5),
-        }.items():  # fmt: skip
-            shapes |= {f"{adapter}.{name}.conv.weight": conv, f"{adapter}.{name}.conv.bias": conv[:1]}
-            for part in ("weight", "bias", "running_mean", "running_var"):
-                shapes[f"{adapter}.{name}.bn.{part}"] = conv[:1]
-            shapes[f"{adapter}.{name}.bn.num_batches_tracked"] = ()
-    shapes["aggregation.1.p"] = (1,)
-    for i in range(2):
-        layer = f"encoder.layers.{i}"
-        shapes |= {f"{layer}.self_attn.in_proj_weight": (2304, 768), f"{layer}.self_attn.in_proj_bias": (2304,)}
-        for name, shape in {
-            "self_attn.out_proj": (768, 768), "linear1": (2048, 768), "linear2": (768, 2048),
-            "norm1": (768,), "norm2": (768,),
-        }.items():  # fmt: skip
-            shapes |= {f"{layer}.{name}.weight": shape, f"{layer}.{name}.bias": shape[:1]}
-    return shapes
 
 
 def recipe(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Tensor]:
@@ -98,9 +54,9 @@ def _value(name: str, shape: tuple[int, ...]) -> Tensor:
 
 
 @pytest.fixture(scope="session")
-def published_state(shared_dir: Path) -> dict[str, Tensor]:
+def published_state() -> dict[str, Tensor]:
     """The 668 tensors behind the reference numbers; read, do not change."""
-    return recipe(published_shapes())
+    return recipe(cricavpr_shapes(768, 12, 37, 24, 2, 2048))
 
 
 @pytest.fixture(scope="session")
@@ -130,4 +86,4 @@ def small_images() -> Tensor:
 @pytest.fixture
 def small_release() -> dict[str, Tensor]:
     """A DINOv2 release state dict at the small model's sizes."""
-    return recipe(backbone_shapes(32, 2, 7, 5, 128))
+    return recipe(dinov2_shapes("", 32, 2, 5, patch=7))

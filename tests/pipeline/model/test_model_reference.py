@@ -1,13 +1,17 @@
-"""The published implementation's own numbers: evaluation, one training step's gradients, three Adam steps."""
+"""The whole model against a restatement of the paper, and against the published implementation's own numbers (which are
+not in this repository): evaluation, one training step's gradients, three Adam steps."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from releases_restated import cricavpr, cricavpr_shapes, filled, multi_similarity
 from torch import Tensor, nn
 
+from pipeline.config import AdapterConfig, BackboneConfig, CrossImageConfig, ModelConfig
 from pipeline.model.vpr import PlaceModel, parameter_counts
 from pipeline.model.weights.files import from_published
 from pipeline.model.weights.names import layout
@@ -16,6 +20,43 @@ from pipeline.training.loss import MultiSimilarityLoss
 
 def off(ours: Tensor, theirs: Any) -> float:
     return float((ours.double() - torch.as_tensor(theirs).double()).abs().max())
+
+
+def test_descriptors_gradients_and_buffers_are_the_restated_models() -> None:
+    """Small, in float64; a grid of 5 x 5 tokens from weights for 4 x 4, cut unevenly into 2 x 2 and 3 x 3 cells."""
+    state = {n: t.double() if t.is_floating_point() else t for n, t in
+             filled(cricavpr_shapes(128, 2, 4, 6, 2, 48)).items()}  # fmt: skip
+    config = ModelConfig(
+        backbone=BackboneConfig(name="custom", dim=128, depth=2, heads=2, patch=14, pretrain_grid=4),
+        adapter=AdapterConfig(reduced=6),
+        cross_image=CrossImageConfig(layers=2, heads=4, feedforward=48, dropout=0.0),
+    )
+    model = from_published({n: t.clone() for n, t in state.items()}, image_size=70, config=config)
+    images = torch.from_numpy(np.random.default_rng(0).standard_normal((8, 3, 70, 70)))
+    with torch.no_grad():
+        assert off(model(images), cricavpr(state, images, 4, train=False)) < 1e-14
+
+    model.train()
+    trained = layout(name for name, parameter in model.named_parameters() if parameter.requires_grad)
+    for name in trained:
+        state[name].requires_grad_()
+    labels = [0] * 4 + [1] * 4
+    loss = MultiSimilarityLoss()(model(images), torch.tensor(labels))
+    truth = multi_similarity(cricavpr(state, images, 4, train=True), labels)
+    loss.backward()
+    truth.backward()
+    assert loss.item() == pytest.approx(truth.item(), abs=1e-13) and truth.item() > 0.1
+    own = dict(model.named_parameters())
+    assert len(trained) == 2 * 24 + 1 + 2 * 12
+    for name, (ours,) in trained.items():
+        theirs, found = state[name].grad, own[ours].grad
+        assert theirs is not None and found is not None
+        if ".conv.bias" in name:  # before a BatchNorm: nothing
+            assert max(theirs.abs().max(), found.abs().max()) < 1e-15
+        else:
+            assert off(found, theirs) <= 1e-9 * float(theirs.abs().max()), name
+    for name, (buffer,) in buffer_names(model).items():
+        assert off(dict(model.named_buffers())[buffer], state[name]) < 1e-12, name
 
 
 @pytest.mark.parametrize(

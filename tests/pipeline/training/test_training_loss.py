@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from processes import run_ranks
+from releases_restated import multi_similarity
 from torch.nn import functional as F
 
 from pipeline.data.positions import points
@@ -168,25 +169,11 @@ def test_pairs_of_near_places_are_ignored_whatever_the_number_of_ranks() -> None
         h = np.sin((lat2 - lat) / 2) ** 2 + np.cos(lat) * np.cos(lat2) * np.sin((lon2 - lon) / 2) ** 2
         return float(2 * 6_371_008.8 * np.arcsin(np.sqrt(h)))
 
-    def defined(within: float) -> torch.Tensor:
-        unit = F.normalize(x, dim=1)
-        total = torch.zeros((), dtype=torch.float64)
-        for q, anchor in enumerate(labels.tolist()):
-            s = unit @ unit[q]
-            same = [i for i, label in enumerate(labels.tolist()) if label == anchor and i != q]
-            other = [
-                i for i, label in enumerate(labels.tolist()) if label != anchor and not metres(anchor, label) < within
-            ]
-            hard, easy = max(s[i] for i in other), min(s[i] for i in same)
-            push = [torch.exp(-s[i]) for i in same if s[i] - 0.1 < hard]
-            pull = [torch.exp(50 * s[i]) for i in other if s[i] + 0.1 > easy]
-            total = total + torch.log1p(sum(push, torch.zeros(()))) + torch.log1p(sum(pull, torch.zeros(()))) / 50
-        return total / len(labels)
-
     losses = {within: near_loss(labels, x, table, within) for within in (0.0, 30.0, 45.0)}
     assert len({round(value, 9) for value, _ in losses.values()}) == 3  # each distance really changes the pairs
     for within, (value, gradient) in losses.items():
-        assert value == pytest.approx(float(defined(within)), rel=1e-12)
+        defined = multi_similarity(x, labels.tolist(), lambda a, b, within=within: metres(a, b) < within)  # type: ignore[misc]
+        assert value == pytest.approx(float(defined), rel=1e-12)
         ranks = run_ranks(near_loss, 2, labels, x, table, within)
         assert [r[0] for r in ranks] == pytest.approx([value] * 2, rel=1e-12)
         torch.testing.assert_close(torch.cat([r[1] for r in ranks]), gradient, rtol=1e-10, atol=1e-14)
