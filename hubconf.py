@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from pipeline.config.image_size import ImageSize
     from pipeline.model.beside import BesideBank
     from pipeline.model.vpr import PlaceModel
 
@@ -25,18 +26,19 @@ dependencies = ["torch", "transformers", "safetensors", "numpy", "PIL"]
 
 
 def place_model(
-    path: str, device: str = "cpu", image_size: int | None = None, bank: bool = True
+    path: str, device: str = "cpu", image_size: int | str | None = None, bank: bool = True
 ) -> PlaceModel | BesideBank:
     """The model of a run folder, a checkpoint folder, a file of ours, or a release of a whole model, in eval mode.
 
-    `model(images [b, 3, S, S])` gives unit descriptors [b, R*D]. Where training saved a bank beside the weights, each
+    `model(images [b, 3, H, W])` gives unit descriptors [b, R*D]. Where training saved a bank beside the weights, each
     image is described beside it and no image changes another's descriptor (`pipeline.model.beside`). Without a bank the
     b images are one group of the cross-image encoder, so pass them one at a time.
 
     Args:
         path: where the weights are.
         device: where the model goes.
-        image_size: side S of the input in pixels; none: what the file says, the method's own for a release.
+        image_size: a side in pixels (224), "480x640" (height x width), or "native"; none: what the file says, for a
+            release that of its authors' evaluation.
         bank: False leaves a bank out.
 
     Raises:
@@ -52,8 +54,10 @@ def place_model(
     return BesideBank(model, model.bank)
 
 
-def place_input(photo: str | Path | bytes, image_size: int = 224) -> Tensor:
-    """A photo (path or encoded bytes) as a model's input: float32 [1, 3, S, S], upright, ImageNet-normalised.
+def place_input(photo: str | Path | bytes, image_size: int | str | ImageSize = 224) -> Tensor:
+    """A photo (path or encoded bytes) as a model's input: float32 [1, 3, H, W], upright, ImageNet-normalised.
+
+    `image_size`: a size, or the model's own `input_size`.
 
     Raises:
         DataError: it cannot be read.
@@ -65,7 +69,7 @@ def place_input(photo: str | Path | bytes, image_size: int = 224) -> Tensor:
 
 def _entry(name: str) -> Callable[..., PlaceModel | BesideBank]:
     def build(
-        path: str | None = None, backbone: str | None = None, image_size: int | None = None, device: str = "cpu"
+        path: str | None = None, backbone: str | None = None, image_size: int | str | None = None, device: str = "cpu"
     ) -> PlaceModel | BesideBank:
         from pipeline.common.errors import UsageError
         from pipeline.model.variants import variant
@@ -89,7 +93,7 @@ def _entry(name: str) -> Callable[..., PlaceModel | BesideBank]:
     Args:
         path: a trained model of this variant, as for `place_model`; none: an untrained one.
         backbone: released backbone weights for an untrained one; none: random weights.
-        image_size: side of the input in pixels; none: what the file says, else 224.
+        image_size: of the input, as for `place_model`; none: what the file says, else 224.
         device: where the model goes.
     """
     return build

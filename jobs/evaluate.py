@@ -27,6 +27,7 @@ from jobs.there import need_model, need_sets
 from pipeline.common.errors import UsageError
 from pipeline.common.files import check_writable
 from pipeline.config import EvaluationConfig, SearchKind, recorded, to_dict
+from pipeline.config.setting import setting
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,9 @@ class EvaluateJob(EvaluationConfig, Processes):
 
     checkpoint: str = ""
     """A run folder (its best checkpoint), a checkpoint folder, a .safetensors file, or a released .pth or .pth.tar."""
+    image_size: str | int | None = setting(None, changes="numbers", image_size="any")
+    """Photos are brought to: a side (224), height x width (480x640), or native, their own shape, longest side at most
+    640 (native800: 800); none: what the checkpoint says, for a release that of its authors' evaluation."""
     output: str | None = None
     """Folder of all results; none: `<run>/evaluation`."""
     track: bool = True
@@ -110,7 +114,7 @@ def run(job: EvaluateJob, config: EvaluationConfig, accelerator: object) -> None
     sets, left_out = agreed(find, what="reading the sets")
     for line in left_out if first else ():
         print(f"left out: {line}", file=sys.stderr)
-    model = agreed(partial(load_any, file, device), what=f"loading {file}")
+    model = agreed(partial(load_any, file, device, job.image_size), what=f"loading {file}")
     fingerprint = model_digest(model)
     projections = projections_from(model, config, device, beside=file.parent, fingerprint=fingerprint)
     results = evaluate(model, sets, config, device, output, True, projections, fingerprint)
@@ -140,6 +144,8 @@ def stored(job: EvaluateJob, folder: Path, config: EvaluationConfig) -> None:
     """Scores the descriptors below `folder`, in this process alone."""
     if job.checkpoint:
         raise UsageError("give --checkpoint or --from_store, not both")
+    if job.image_size is not None:
+        raise UsageError("--image_size: stored descriptors have their own; leave it out, or evaluate again")
     for field in dataclasses.fields(EvaluationConfig):
         if field.name not in OPEN and getattr(config, field.name) != field.default:
             raise UsageError(f"--{field.name}: stored descriptors have their own; leave it out, or evaluate again")

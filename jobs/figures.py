@@ -24,6 +24,7 @@ from jobs.there import need_sets
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import check_writable, write_atomically
 from pipeline.config import EvaluationConfig, ModelConfig
+from pipeline.config.setting import setting
 from pipeline.model.weights.where import check_weights
 
 
@@ -40,6 +41,8 @@ class FiguresJob(EvaluationConfig):
     """Which images are described together; only the first value counts."""
     checkpoint: str = ""
     """Our model: a run or checkpoint folder, a file, or a released .pth."""
+    image_size: str | int | None = setting(None, changes="numbers", image_size="any")
+    """What photos are brought to, as in jobs.evaluate; none: what each model's file says."""
     baseline: tuple[str, ...] = ()
     """Models to compare with, as for --checkpoint; attention and tsne also take a backbone's weights, and without
     --baseline use the checkpoint's own backbone without its adapters."""
@@ -92,7 +95,7 @@ def main() -> None:
     import torch
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    model = _model(job.checkpoint, None, device)
+    model = _model(job.checkpoint, None, device, job.image_size)
     {"attention": attention, "tsne": places, "qualitative": qualitative}[job.kind](job, model, device)
     print(f"written to {job.to}")
 
@@ -119,13 +122,14 @@ def attention(job: FiguresJob, model: Any, device: Any) -> None:
     photos = _photos(job.photos)
     maps = []
     for name in job.baseline:
-        maps.append((_short(name), attention_maps(_model(name, model, device), photos)))
+        maps.append((_short(name), attention_maps(_model(name, model, device, job.image_size), photos)))
     if not maps:
         with pretrained(model):
             maps.append(("pre-trained", attention_maps(model, photos)))
     maps.append(("adapted", attention_maps(model, photos)))
-    below = f"Channel mean of the patch tokens, {model.image_size} px, each map over its own range · {job.checkpoint}"
-    attention_comparison(photos, maps, int(model.image_size), Path(job.to), below)
+    size = model.input_size
+    below = f"Channel mean of the patch tokens, {size.text} px, each map over its own range · {job.checkpoint}"
+    attention_comparison(photos, maps, size, Path(job.to), below)
 
 
 def places(job: FiguresJob, model: Any, device: Any) -> None:
@@ -134,7 +138,7 @@ def places(job: FiguresJob, model: Any, device: Any) -> None:
     from pipeline.paper.place_features import choose_places, stages
 
     chosen = choose_places(Path(job.places_from), job.places, job.images, job.seed)
-    baselines = [(_short(name), _model(name, model, device)) for name in job.baseline]
+    baselines = [(_short(name), _model(name, model, device, job.image_size)) for name in job.baseline]
     config = _config(job)
     found = stages(model, baselines, chosen.paths, config, device)
     groups = config.groups[0] + ("" if config.groups[0] == "single" else str(config.group_size))
@@ -154,7 +158,9 @@ def qualitative(job: FiguresJob, model: Any, device: Any) -> None:
     evaluated = load_set(job.sets[0], config)
     results = [("ours", evaluate(model, [evaluated], config, device)[0])]
     for name in job.baseline:
-        results.append((_short(name), evaluate(_model(name, None, device), [evaluated], config, device)[0]))
+        results.append(
+            (_short(name), evaluate(_model(name, None, device, job.image_size), [evaluated], config, device)[0])
+        )
     found = retrieval_comparison(evaluated, results, Path(job.to), job.count)
     print(f"ours alone right: {len(found.ours)}; {results[1][0]} alone right: {len(found.baseline)}")
 
@@ -164,19 +170,19 @@ def _config(job: FiguresJob) -> EvaluationConfig:
     return EvaluationConfig(**values | {"groups": job.groups[:1]})
 
 
-def _model(source: str, like: Any | None, device: Any) -> Any:
+def _model(source: str, like: Any | None, device: Any, image_size: int | str | None) -> Any:
     """A model; or, where one is given to compare with, released weights in a backbone like its own."""
     from pipeline.model.weights import convert
 
     kind = convert.kind_of(source)
     if kind != "backbone":
-        return convert.read_model(source, kind, ModelConfig(), None).to(device)
+        return convert.read_model(source, kind, ModelConfig(), image_size).to(device)
     if like is None:
         raise UsageError(f"{source}: a backbone alone; make it a model first: jobs.weights --variant FrozenDINOv2-SPM")
     from pipeline.model.variants import variant
 
     config = variant("FrozenDINOv2-SPM", like.config)
-    return convert.around_backbone(source, config, int(like.image_size)).to(device)
+    return convert.around_backbone(source, config, like.image_size).to(device)
 
 
 def _photos(given: tuple[str, ...], each: int = 6) -> list[Path]:

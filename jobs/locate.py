@@ -25,6 +25,7 @@ from jobs.there import need_model
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import check_writable, write_atomically
 from pipeline.config import SearchKind
+from pipeline.config.setting import setting
 
 if TYPE_CHECKING:
     from pipeline.locate.answers import Answer, Locator
@@ -74,6 +75,9 @@ class LocateJob:
     """Building: dimensions kept from the beginning of the descriptor (of a model trained with loss.prefixes)."""
     pca: int | None = None
     """Building: dimensions kept by PCA of the index's own photos; none keeps all."""
+    image_size: str | int | None = setting(None, changes="numbers", image_size="any")
+    """Building: what photos are brought to, as in jobs.evaluate; none: what the checkpoint says. Photos that ask are
+    brought to what the index was made with."""
     resize: Literal["antialias", "published"] = "antialias"
     """Building: antialias as in training; published: normalise, then resize without."""
     precision: Literal["fp32", "bf16", "fp16"] = "fp32"
@@ -154,7 +158,7 @@ def run(job: LocateJob) -> None:
     from pipeline.locate.no_match import Apart
     from pipeline.locate.photo_index import make_index, open_index
     from pipeline.locate.photos import check_zone
-    from pipeline.model.weights.files import checkpoint_file
+    from pipeline.model.weights.files import at_size, checkpoint_file
     from pipeline.model.weights.load import load_any
 
     check_zone(job.zone)
@@ -170,7 +174,7 @@ def run(job: LocateJob) -> None:
         check_writable(Path(job.output), "--output")
     elif photos and folder.is_dir():
         check_writable(folder, "--output")
-    model = load_any(file, device)
+    model = load_any(file, device, job.image_size)
     fingerprint = model_digest(model)
     if job.build:
         batch = job.batch or (1 if torch.device(device).type == "cpu" else 32)
@@ -191,6 +195,12 @@ def run(job: LocateJob) -> None:
         print(no_match_text(index.calibration))
     else:
         index = open_index(folder, fingerprint)
+        if job.image_size not in (None, index.protocol.image_size):
+            raise UsageError(
+                f"--image_size {job.image_size}: {folder} was made with {index.protocol.image_size}; leave it out, or "
+                "build the index again"
+            )
+        model = at_size(model, index.protocol.image_size)
     if photos:
         tell(job, index, locate(model, index, photos, job.answers, device, radius=job.radius))
     if job.serve:

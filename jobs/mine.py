@@ -77,6 +77,11 @@ def run(job: MineJob, data: DataConfig, accelerator: object) -> None:
     on_rank_0(lambda: out.parent.mkdir(parents=True, exist_ok=True), what=f"making {out.parent}")
     index = agreed(lambda: open_shards(data), what="opening the shards")
     model = agreed(lambda: load_any(job.checkpoint, device), what=f"loading {job.checkpoint}")
+    if model.input_size.native:
+        raise UsageError(
+            f"{job.checkpoint}: takes photos in their own shape (image_size {model.image_size}), but places are "
+            "described at one size: write it at one with jobs.weights --image_size"
+        )
     data = dataclasses.replace(data, image_size=model.image_size)
     found = describe_places(model, index, data, job.kind, job.round, device, autocast, temporary=out.parent)
 

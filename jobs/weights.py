@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Literal
 from jobs.cli import parse, run_job
 from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig
+from pipeline.config.setting import setting
 from pipeline.model.weights.where import check_weights
 
 if TYPE_CHECKING:
@@ -45,8 +46,9 @@ class WeightsJob:
     ] = "auto"  # fmt: skip
     """What the source must be; auto looks. cosplace is EigenPlaces too; gcl_avg must be said, its average pooling
     leaves no trace in the file."""
-    image_size: int | None = None
-    """Side of the input in pixels; none: as the file says; for released weights the method's own (CricaVPR: 224)."""
+    image_size: str | int | None = setting(None, changes="numbers", image_size="any")
+    """Of the input: a side (224), height x width (480x640), or native (not for .onnx); none: as the file says; for
+    released weights that of their authors' evaluation (CricaVPR: 224)."""
     variant: str = ""
     """For a backbone: write the whole model of this variant of the paper, with the rest untrained."""
     onnx: Literal["descriptors", "single", "regions"] = "descriptors"
@@ -111,7 +113,7 @@ def _describe(model: PlaceModel) -> None:
     from pipeline.model.vpr import parameter_counts
 
     counts = parameter_counts(model)
-    print(f"  {model.image_size} px -> {model.descriptor_dim:,} numbers ({model.regions} regions)")
+    print(f"  {model.input_size.text} px -> {model.descriptor_dim:,} numbers ({model.regions} regions)")
     print(f"  parameters: {', '.join(f'{name} {count:,}' for name, count in counts.items())}")
 
 
@@ -123,7 +125,7 @@ def _write(model: PlaceModel, target: Path, job: WeightsJob) -> None:
 
         difference = export_onnx(model, target, job.onnx)
         print(f"  onnxruntime against torch, 1 and 3 images: largest difference {difference:.1e}")
-        _wrote(target, f"input 'images' [batch, 3, {model.image_size}, {model.image_size}], one output")
+        _wrote(target, "input 'images' [batch, 3, {}, {}], one output".format(*model.input_size.largest))
     elif target.suffix == ".pth":
         convert.write_published(model, target)
         _wrote(target, "published names, tensors alone")

@@ -44,7 +44,7 @@ class Model:
     """A model that is ready to describe photos.
 
     Attributes:
-        module: the network, in eval mode; `module(images [n, 3, S, S])` describes one group of the cross-image encoder.
+        module: the network, in eval mode; `module(images [n, 3, H, W])` describes one group of the cross-image encoder.
         device: where it is.
     """
 
@@ -100,13 +100,16 @@ class Model:
         return found
 
 
-def load_model(path: str | Path, device: torch.device | str | None = None, image_size: int | None = None) -> Model:
+def load_model(
+    path: str | Path, device: torch.device | str | None = None, image_size: int | str | None = None
+) -> Model:
     """A model ready to use.
 
     Args:
         path: a run folder (its best checkpoint), a checkpoint folder, a file of ours, or a release of a whole model.
         device: none: a GPU where there is one.
-        image_size: side S of the input in pixels; none: what the file says, the method's own for a release.
+        image_size: what photos are brought to: a side (224), "480x640" (height x width), or "native"; none: what the
+            file says, for a release that of its authors' evaluation.
 
     Raises:
         UsageError: nothing there, or weights that do not fit; DataError: a broken file.

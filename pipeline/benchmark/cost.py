@@ -9,6 +9,7 @@ Shapes: b images on a rank, B = b W in the global batch, R regions, D channels, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -69,7 +70,7 @@ def step_sizes(model: PlaceModel, images: int, key_bytes: int = 4, passes: int =
         dim=model.descriptor_dim // model.regions,
         layers=encoder.layers,
         feedforward=encoder.feedforward,
-        tokens=1 + model.backbone.grid**2,
+        tokens=1 + math.prod(model.backbone.grid),
         depth=model.backbone.depth,
         norms=_exchanges(model.backbone),
         trained=counts["trainable"],
@@ -185,7 +186,7 @@ def table(sizes: StepSizes, worlds: Sequence[int]) -> Table:
 
 def tables(
     config: ModelConfig,
-    image_size: int,
+    image_size: int | str,
     places_per_rank: int,
     worlds: Sequence[int],
     key_bytes: int = 4,

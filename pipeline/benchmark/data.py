@@ -77,12 +77,12 @@ def decoding(photos: list[bytes], rounds: int, size: int) -> Comparison:
     def augmented(kind: Augment) -> Callable[[], None]:
         def run() -> None:
             for number, data in enumerate(photos):
-                training_view(decode(data), size, kind, 3, 9, Draws(number))
+                training_view(decode(data), (size, size), kind, 3, 9, Draws(number))
 
         return run
 
     ways: dict[str, Callable[[], object]] = {
-        "decode and resize": lambda: [shrink(decode(data), size) for data in photos],
+        "decode and resize": lambda: [shrink(decode(data), (size, size)) for data in photos],
         "decode alone": lambda: [decode(data) for data in photos],
         "with light augmentation": augmented("light"),
         "with RandAugment (3, 9)": augmented("rand"),

@@ -70,8 +70,8 @@ class DataConfig(Settings):
     """mined: randomness of the draw, in units of cosine similarity; 0 draws the most similar places."""
     window_shards: int = setting(8, changes="numbers", at_least=1)
     """Shards read together by order=blocked."""
-    image_size: int = setting(224, changes="numbers", at_least=1, at_most=8192)
-    """Side of the square input, in pixels; a multiple of the patch size (paper: 224)."""
+    image_size: str | int = setting(224, changes="numbers", image_size="fixed")
+    """Size of the input in pixels: a side (`224`, paper), or height x width (`224x308`); multiples of the patch."""
     augment: Literal["rand", "light", "off"] = setting("rand", changes="numbers")
     """rand: RandAugment as published; light: small changes of colour and crop; off: nothing."""
     rand_ops: int = setting(3, changes="numbers", at_least=0, at_most=16)

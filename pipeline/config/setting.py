@@ -21,6 +21,7 @@ from typing import Any, Literal, TypeVar
 
 from pipeline.common.errors import UsageError
 from pipeline.common.text import shown
+from pipeline.config.image_size import ANY, FIXED, parsed
 
 Value = TypeVar("Value")
 Changes = Literal["numbers", "speed", "none"]
@@ -51,6 +52,7 @@ def setting(
     below: float | None = None,
     may_be_empty: bool = False,
     file_name: bool = False,
+    image_size: Literal["fixed", "any", ""] = "",
     formerly: str = "",
 ) -> Value:
     """A field of a `Settings` class.
@@ -63,13 +65,14 @@ def setting(
         at_least, at_most, above, below: bounds of a number, or of each number of a tuple. Numbers are always finite.
         may_be_empty: whether a text or a tuple may be empty.
         file_name: the text becomes a plain file name: no separators, not hidden, at most 200 bytes.
+        image_size: the value is a size of input (`image_size.ImageSize`), `native` among them or not.
         formerly: the name it has in older configs.
     """
     about = {
         "changes": changes,
         "resume": resume,
         "at_least": at_least, "at_most": at_most, "above": above, "below": below,
-        "may_be_empty": may_be_empty, "file_name": file_name, "formerly": formerly,
+        "may_be_empty": may_be_empty, "file_name": file_name, "image_size": image_size, "formerly": formerly,
     }  # fmt: skip
     return dataclasses.field(default=default, metadata=about)
 
@@ -88,7 +91,8 @@ class Settings:
 def check(config: Any) -> None:
     """Refuses a frozen dataclass whose own fields (not its sections') are outside their types or ranges.
 
-    Lists become tuples, and whole numbers become floats where a float is wanted. Raises `SettingError`.
+    Lists become tuples, whole numbers floats where a float is wanted, and sizes of input take their canonical form.
+    Raises `SettingError`.
     """
     kind: type = type(config)
     hints = type_hints(kind)
@@ -98,7 +102,7 @@ def check(config: Any) -> None:
             value = _fitting(field.metadata, hints[field.name], given)
         except ValueError:
             raise SettingError(field.name, wanted(field, hints[field.name]), given) from None
-        if type(value) is not type(given):
+        if type(value) is not type(given) or value != given:
             object.__setattr__(config, field.name, value)
 
 
@@ -188,6 +192,9 @@ def shortened(value: Any) -> str:
 def wanted(field: dataclasses.Field[Any], hint: Any) -> str:
     """What a field takes, in words: "a whole number of at least 1, or none"."""
     about = field.metadata
+    if about.get("image_size"):
+        optional = ", or none" if types.NoneType in typing.get_args(hint) else ""
+        return (FIXED if about["image_size"] == "fixed" else ANY) + optional
     if alternatives(hint) != (hint,):
         told = [wanted(field, kind) for kind in alternatives(hint)]
         return ", or ".join(told + ["none"] * (types.NoneType in typing.get_args(hint)))
@@ -214,6 +221,8 @@ def wanted(field: dataclasses.Field[Any], hint: Any) -> str:
 
 def _fitting(about: Any, hint: Any, value: Any) -> Any:
     """Raises ValueError where `value` is not of the type `hint` or outside the range in `about`."""
+    if about.get("image_size") and value is not None:
+        return parsed(value, about["image_size"] == "fixed").setting
     if alternatives(hint) != (hint,):
         if value is None and types.NoneType in typing.get_args(hint):
             return None

@@ -56,12 +56,12 @@ class Draws:
 
 
 def training_view(
-    pixels: NDArray[np.uint8], size: int, augment: Augment, ops: int, magnitude: int, draws: Draws
+    pixels: NDArray[np.uint8], shape: tuple[int, int], augment: Augment, ops: int, magnitude: int, draws: Draws
 ) -> NDArray[np.uint8]:
-    """An RGB image, uint8 [H, W, 3] of any size -> an augmented one, [size, size, 3]."""
+    """An RGB image, uint8 [H, W, 3] of any size -> an augmented one of `shape` = (H', W')."""
     if augment == "light":
-        return _light(pixels, size, draws)
-    small = shrink(pixels, size)
+        return _light(pixels, shape, draws)
+    small = shrink(pixels, shape)
     return np.asarray(rand_augment(Image.fromarray(small), ops, magnitude, draws)) if augment == "rand" else small
 
 
@@ -83,12 +83,12 @@ def rand_augment(image: Image.Image, ops: int, magnitude: int, draws: Draws) -> 
     return image
 
 
-def _light(pixels: NDArray[np.uint8], size: int, draws: Draws) -> NDArray[np.uint8]:
+def _light(pixels: NDArray[np.uint8], shape: tuple[int, int], draws: Draws) -> NDArray[np.uint8]:
     """A crop of 80 to 100 % of each side, then brightness and contrast within 20 %."""
     height, width = pixels.shape[:2]
     h, w = math.ceil(height * draws.uniform(0.8, 1.0)), math.ceil(width * draws.uniform(0.8, 1.0))
     top, left = draws.below(height - h + 1), draws.below(width - w + 1)
-    image = Image.fromarray(shrink(pixels[top : top + h, left : left + w], size))
+    image = Image.fromarray(shrink(pixels[top : top + h, left : left + w], shape))
     image = ImageEnhance.Brightness(image).enhance(draws.uniform(0.8, 1.2))
     return np.asarray(ImageEnhance.Contrast(image).enhance(draws.uniform(0.8, 1.2)))
 

@@ -25,6 +25,7 @@ from pipeline.common import pictures
 from pipeline.common.errors import DataError
 from pipeline.common.pictures import check_size
 from pipeline.common.text import shown
+from pipeline.config.image_size import ImageSize
 
 try:
     import simplejpeg
@@ -56,22 +57,25 @@ def load_image(source: Path | str | bytes) -> Image.Image:
         raise DataError(f"{name}: {error}{ADVICE}") from None
 
 
-def to_input(image: Image.Image, size: int, resize: Literal["antialias", "published"] = "antialias") -> Tensor:
-    """An RGB image as input of side S = `size`.
+def to_input(
+    image: Image.Image, size: int | str | ImageSize, resize: Literal["antialias", "published"] = "antialias"
+) -> Tensor:
+    """An RGB image as input of H x W, as `size` gives them (`ImageSize.of_photo`).
 
-    `antialias`: as in training, uint8 [3, S, S], to be normalised on the device. `published`: the published evaluation
-    order, normalised first and then resized bilinearly *without* antialias, float32 [3, S, S].
+    `antialias`: as in training, uint8 [3, H, W], to be normalised on the device. `published`: the published evaluation
+    order, normalised first and then resized bilinearly *without* antialias, float32 [3, H, W].
     """
+    shape = ImageSize.of(size).of_photo(image.height, image.width)
     if resize == "antialias":
-        return to_tensor(shrink(np.asarray(image), size))
+        return to_tensor(shrink(np.asarray(image), shape))
     pixels = normalise(to_tensor(np.asarray(image)))
-    return F.interpolate(pixels[None], (size, size), mode="bilinear", align_corners=False, antialias=False)[0]
+    return F.interpolate(pixels[None], shape, mode="bilinear", align_corners=False, antialias=False)[0]
 
 
-def shrink(pixels: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-    """Resizes uint8 [H, W, 3] to [size, size, 3]; bilinear with antialias."""
+def shrink(pixels: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Resizes uint8 [H, W, 3] to `shape` = (H', W'); bilinear with antialias."""
     planes = torch.from_numpy(np.require(pixels, requirements=["C", "W"])).permute(2, 0, 1)[None]
-    small = F.interpolate(planes, (size, size), mode="bilinear", align_corners=False, antialias=True)
+    small = F.interpolate(planes, shape, mode="bilinear", align_corners=False, antialias=True)
     return np.ascontiguousarray(small[0].permute(1, 2, 0).numpy())
 
 

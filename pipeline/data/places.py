@@ -22,6 +22,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from pipeline.common.errors import DataError, UsageError, told
 from pipeline.config import DataConfig
+from pipeline.config.image_size import ImageSize
 from pipeline.data import workers
 from pipeline.data.augment import Draws, check, training_view
 from pipeline.data.cache import ShardCache
@@ -42,7 +43,7 @@ class Batch(NamedTuple):
     """This rank's part of a global batch; b = 4 places_per_batch / W images."""
 
     images: Tensor
-    """uint8 [b, 3, S, S], place-major: four consecutive images are one place."""
+    """uint8 [b, 3, H, W], place-major: four consecutive images are one place."""
     labels: Tensor
     """int64 [b], the number of each image's place."""
     keys: list[str]
@@ -122,8 +123,8 @@ class Places(Dataset[Batch | Failure]):
 
     def batch(self, positions: list[int]) -> Batch:
         """Reads, decodes and augments places. Raises `DataError` naming shard, sample and member."""
-        size = self.data.image_size
-        images = torch.empty((len(positions) * VIEWS, 3, size, size), dtype=torch.uint8)
+        shape = ImageSize.of(self.data.image_size).largest
+        images = torch.empty((len(positions) * VIEWS, 3, *shape), dtype=torch.uint8)
         for place, position in enumerate(positions):
             sample = self.found.samples[position]
             for view, encoded in enumerate(self.encoded(position)):
@@ -137,7 +138,7 @@ class Places(Dataset[Batch | Failure]):
                     ) from None
                 draws = Draws("view", self.seed, int(self.turns[position]), sample, view)
                 augmented = training_view(
-                    pixels, size, self.data.augment, self.data.rand_ops, self.data.rand_magnitude, draws
+                    pixels, shape, self.data.augment, self.data.rand_ops, self.data.rand_magnitude, draws
                 )
                 images[place * VIEWS + view] = torch.from_numpy(np.require(augmented, requirements="W")).permute(
                     2, 0, 1

@@ -17,6 +17,7 @@ import numpy as np
 
 from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
+from pipeline.config.image_size import ImageSize
 from pipeline.evaluation.search.approximate import CODES
 from pipeline.model.bank import Bank
 
@@ -77,8 +78,8 @@ class Protocol:
     """Dimensions kept from the beginning of the descriptor, of unit length again; None keeps all."""
     resize: str = named("_{}", "descriptors", "antialias")
     """antialias, or published: normalised first, then bilinear without antialias."""
-    image_size: int = named("_{}px", "descriptors", 224)
-    """Side of the square input, pixels."""
+    image_size: int | str = named("_{}px", "descriptors", 224)
+    """Of the input, pixels: a side (224), "480x640", or "native640": the photo's own shape, at most 640 long."""
     rule: str = named("_{}", "answers", "25 m")
     """What counts as a positive, for example "25 m"."""
     without_positives: str = named("_{}", "answers", "miss")
@@ -132,8 +133,9 @@ class Protocol:
         second = f", first {self.rerank} re-ranked by {SECOND_STAGES[self.rerank_by]}{layer}" if self.rerank else ""
         floats = f", first {self.refine} ordered anew by float descriptors" if self.refine else ""
         kept = self.precision if self.stored == self.precision else f"{self.precision}, stored {self.stored}"
+        size = ImageSize.of(self.image_size).text
         return (
-            f"{groups}; {self.image_size} px {interpolation}; {pca}; {kept}; {self.search} L2 search{floats}{second}; "
+            f"{groups}; {size} px {interpolation}; {pca}; {kept}; {self.search} L2 search{floats}{second}; "
             f"positives {self.rule}; queries without positives {missing}"
         )
 
@@ -178,7 +180,7 @@ def candidates(kind: str, config: EvaluationConfig) -> int:
     return config.refine if kind in CODES else 0
 
 
-def protocols(config: EvaluationConfig, image_size: int, rule: str, bank: Bank | None = None) -> list[Protocol]:
+def protocols(config: EvaluationConfig, image_size: int | str, rule: str, bank: Bank | None = None) -> list[Protocol]:
     """The protocols that the configuration asks for, in its order; `bank`: the one that `groups` bank is beside.
 
     Raises:

@@ -18,6 +18,7 @@ from torch import nn
 
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.progress import track
+from pipeline.config.image_size import input_size
 from pipeline.evaluation.describe.broken import broken_photos, problem_of
 from pipeline.evaluation.describe.encode import describe_alone, evaluating
 from pipeline.evaluation.protocol import Protocol
@@ -89,7 +90,13 @@ class Locator:
     """A model and an index that are ready to answer."""
 
     def __init__(self, model: nn.Module, index: PhotoIndex, device: torch.device | str, radius: float = RADIUS) -> None:
-        """`radius`: metres within which an answer is right. Raises `UsageError` for another bank than the index's."""
+        """`radius`: metres within which an answer is right. Raises `UsageError` for another bank or size of input than
+        the index's."""
+        if input_size(model).setting != index.protocol.image_size:
+            raise UsageError(
+                f"the index was made of photos at image_size {index.protocol.image_size}, this model takes "
+                f"{input_size(model).setting}: load it with the index's, or build the index again"
+            )
         self.model, self.index, self.device, self.radius = model, index, torch.device(device), radius
         with evaluating(model):
             self._memory = memory_of(model, index.protocol)

@@ -31,6 +31,7 @@ from torch import nn
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import locked, naming, sync_path, write_atomically
 from pipeline.config import EvaluationConfig
+from pipeline.config.image_size import input_size
 from pipeline.evaluation.describe.bank import chosen_bank
 from pipeline.evaluation.describe.encode import describe_each, evaluating
 from pipeline.evaluation.identity import Identity
@@ -139,7 +140,7 @@ def make_index(
         config, groups=groups, bank_from="train", bank=LARGEST, store="none", pca_from=None, rerank=0, recalls=(1,)
     )
     bank = chosen_bank(model, config, (), device)
-    protocol = protocols(config, int(model.image_size), "none", bank)[0]  # type: ignore[arg-type]
+    protocol = protocols(config, input_size(model).setting, "none", bank)[0]
     check_prefix(protocol.prefix, int(model.descriptor_dim))  # type: ignore[arg-type]
     apart = apart or Apart()
     photos = find_photos(sources, progress, zone)

@@ -1,6 +1,6 @@
 """Adapters: small trainable bottlenecks added to the frozen MLP of a block (paper, section 3.3).
 
-Invariant: an adapter maps tokens [b, 1 + G*G, D] to the same shape; the class token skips the convolutions but
+Invariant: an adapter maps tokens [b, 1 + h*w, D] to the same shape; the class token skips the convolutions but
 takes part in the skip sum (so under a skip it enters the last Linear doubled, as published). The last Linear
 starts at zero: training starts from the released model's own output.
 """
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from pipeline.common.errors import UsageError
 from pipeline.config import AdapterConfig
 from pipeline.model.batch_norm import GlobalBatchNorm2d, normalised_together
+from pipeline.model.pooling import Grid
 
 NORM_EPS = 1e-3  # published: BatchNorm2d(eps=0.001)
 
@@ -87,26 +88,33 @@ class ConvAdapter(nn.Module):
         paths: for each path its convolutions as (output channels, kernel): a 1x1, and perhaps one more.
         skip: whether the input of the paths is added to their output.
         norm: "batch", "group" or "none".
+        grid: rows h and columns w of the patch map.
         others: tokens that are no patches and skip the convolutions: the class token, and registers behind it.
     """
 
     def __init__(
-        self, dim: int, width: int, paths: list[list[tuple[int, int]]], skip: bool, norm: str, others: int = 1
+        self,
+        dim: int,
+        width: int,
+        paths: list[list[tuple[int, int]]],
+        skip: bool,
+        norm: str,
+        grid: Grid,
+        others: int = 1,
     ) -> None:
         super().__init__()
         self.down = nn.Linear(dim, width)
         self.paths = nn.ModuleList(_path(width, path, norm) for path in paths)
         self.up = nn.Linear(width, dim)
-        self.skip, self.others = skip, others
+        self.skip, self.grid, self.others = skip, grid, others
 
     def forward(self, x: Tensor) -> Tensor:
-        """[b, others + G*G, D] -> [b, others + G*G, D]."""
+        """[b, others + h*w, D] -> [b, others + h*w, D]."""
         hidden = torch.relu(self.down(x))
         first, second = self.steps()
         weight = torch.cat([step.conv.weight.flatten(1) for step in first])
         products = F.linear(hidden, weight, torch.cat([cast(Tensor, step.conv.bias) for step in first]))
-        side = round((hidden.shape[1] - self.others) ** 0.5)
-        grid = products[:, self.others :].contiguous().unflatten(1, (side, side)).permute(0, 3, 1, 2)
+        grid = products[:, self.others :].contiguous().unflatten(1, self.grid).permute(0, 3, 1, 2)
         maps = _normalised(first, grid).split([step.conv.out_channels for step in first], dim=1)
         ends = [part for part, path in zip(maps, self.paths, strict=True) if isinstance(path, ConvNorm)]
         if second:
@@ -153,8 +161,9 @@ def paths_of(kind: str, width: int, reduced: int) -> list[list[tuple[int, int]]]
     return [[(width, 1)]] if kernel == 1 else [[(reduced, 1), (width, kernel)]]
 
 
-def build_adapter(config: AdapterConfig, dim: int, others: int = 1) -> nn.Module:
-    """One block's adapter for token width `dim`, initialised; `others` tokens before the patches are no patches.
+def build_adapter(config: AdapterConfig, dim: int, grid: Grid, others: int = 1) -> nn.Module:
+    """One block's adapter for token width `dim`, initialised, for a `grid` of patches behind `others` tokens that are
+    none.
 
     Raises:
         UsageError: a bottleneck too narrow for its paths.
@@ -167,7 +176,7 @@ def build_adapter(config: AdapterConfig, dim: int, others: int = 1) -> nn.Module
         adapter = VanillaAdapter(dim, width)
     else:
         paths = paths_of(config.kind, width, config.reduced)
-        adapter = ConvAdapter(dim, width, paths, skip=config.kind != "conv", norm=config.norm, others=others)
+        adapter = ConvAdapter(dim, width, paths, skip=config.kind != "conv", norm=config.norm, grid=grid, others=others)
     _initialise(adapter, config.init)
     return adapter
 

@@ -12,11 +12,11 @@ from pipeline.model.vpr import PlaceModel
 
 
 class BesideBank(nn.Module):
-    """images [b, 3, S, S], ImageNet-normalised -> descriptors [b, R*D]; in eval mode. The bank's keys and values are
+    """images [b, 3, H, W], ImageNet-normalised -> descriptors [b, R*D]; in eval mode. The bank's keys and values are
     buffers, so they move and are exported with the module.
 
     Attributes:
-        model: the model itself; `config`, `image_size` and `descriptor_dim` are its own.
+        model: the model itself; `config`, `image_size`, `input_size` and `descriptor_dim` are its own.
 
     Raises:
         UsageError: a model or a bank that does not fit (`PlaceModel.remember`).
@@ -25,7 +25,8 @@ class BesideBank(nn.Module):
     def __init__(self, model: PlaceModel, bank: Bank) -> None:
         super().__init__()
         self.model, self.bank = model.eval(), bank
-        self.config, self.image_size, self.descriptor_dim = model.config, model.image_size, model.descriptor_dim
+        self.config, self.image_size, self.input_size = model.config, model.image_size, model.input_size
+        self.descriptor_dim = model.descriptor_dim
         self.layers = len(model.cross_image.layers)
         for number, (keys, values) in enumerate(model.remember(bank)):
             self.register_buffer(f"keys{number}", keys.detach(), persistent=False)
@@ -37,5 +38,5 @@ class BesideBank(nn.Module):
         return [(held[f"keys{number}"], held[f"values{number}"]) for number in range(self.layers)]
 
     def forward(self, images: Tensor) -> Tensor:
-        """[b, 3, S, S] -> [b, R*D], of unit length."""
+        """[b, 3, H, W] -> [b, R*D], of unit length."""
         return self.model.correlate_beside(self.model.encode(images), self.memory())

@@ -2,7 +2,7 @@
 
 Invariant: BatchNorm sees what it sees without chunks, the global batch; so the result, the gradients and the running
 buffers are those of the unchunked model, to rounding. The price is memory: BatchNorm needs all images of a layer at
-once, forward and backward, so two maps of tokens [b, 1 + G*G, D] a block are kept, and while one block is in backward
+once, forward and backward, so two maps of tokens [b, 1 + h*w, D] a block are kept, and while one block is in backward
 its adapter's maps for all b images. Peak memory still grows with b, with a much smaller slope (docs/performance.md);
 without BatchNorm (`adapter.norm: group` or `none`) it does not, because each chunk then goes through alone.
 """

@@ -8,12 +8,16 @@ group on this rank. So the descriptor of an image depends on its group, and neve
 
 from __future__ import annotations
 
+import dataclasses
+from functools import partial
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig
+from pipeline.config.image_size import ImageSize
 from pipeline.model.aggregators import build_pooling
 from pipeline.model.backbones.resnet import ResNet, is_resnet
 from pipeline.model.backbones.transformer import Backbone
@@ -33,7 +37,8 @@ class PlaceModel(nn.Module):
     """Backbone, pooling and cross-image encoder as one; see `build_model`.
 
     Attributes:
-        config, image_size: what it was built from.
+        config, image_size: what it was built from, the size in its canonical form (224, "480x640", "native640").
+        input_size: what a photo is brought to; of `native`, one that depends on the photo.
         regions: R, regional features of an image.
         descriptor_dim: R * D, length of a descriptor; D is the backbone's width, or the aggregator's where it has its
             own (which is R = 1 for those that give one flat descriptor).
@@ -42,24 +47,34 @@ class PlaceModel(nn.Module):
     correlates_alone = True  # `correlate` knows `alone`
     bank: Bank | None = None  # the one saved beside the weights; no part of them
 
-    def __init__(self, config: ModelConfig, image_size: int) -> None:
+    def __init__(self, config: ModelConfig, image_size: int | str) -> None:
         super().__init__()
         self.config = config
-        self.image_size = image_size
+        size = ImageSize.of(image_size)
+        self.image_size = size.setting
         name = config.backbone.name
         others: dict[str, type[ResNet | VGG | TransVPR]] = {"vgg16": VGG, "transvpr": TransVPR}
         kind: type[Network] = ResNet if is_resnet(name) else others.get(name, Backbone)
-        self.backbone: Network = kind(config, image_size)
+        self.backbone: Network = kind(config, size)
         self.pooling = build_pooling(config.pooling, self.backbone.dim, self.backbone.grid)
+        self.input_size = self.backbone.size
+        if size.native:
+            if self.pooling.least is None:
+                raise UsageError(
+                    f"pooling.kind {config.pooling.kind} has weights for one size of input: image_size "
+                    f"{size.setting} is none; give a side, or height x width"
+                )
+            least = max(self.input_size.least, self.backbone.stride * self.pooling.least)
+            self.input_size = dataclasses.replace(self.input_size, least=least)
         self.cross_image = CrossImageEncoder(self.pooling.dim, config.cross_image)
         self.regions = self.pooling.regions
         self.descriptor_dim = self.regions * self.pooling.dim
 
     def encode(self, images: Tensor, chunk: int | None = None) -> Tensor:
-        """Regional features of normalised images: [b, 3, S, S] -> [b, R, D].
+        """Regional features of normalised images: [b, 3, H, W] -> [b, R, D].
 
         Args:
-            images: float, ImageNet-normalised, S = `image_size`.
+            images: float, ImageNet-normalised, H x W as `input_size` gives them.
             chunk: images encoded at a time and recomputed in backward; the result is the same, to rounding. Each chunk
                 keeps its input alone, so peak memory depends on the chunk and not on b. With BatchNorm in training
                 the chunks go in step, block by block (pipeline.model.chunked), so that it still sees the global
@@ -68,14 +83,18 @@ class PlaceModel(nn.Module):
         Raises:
             UsageError: images of another size; a chunk below 1.
         """
-        if images.ndim != 4 or images.shape[-2:] != (self.image_size, self.image_size):
-            raise UsageError(
-                f"the model takes images [b, 3, {self.image_size}, {self.image_size}], got {[*images.shape]}"
-            )
+        if images.ndim != 4 or not self.input_size.takes(*images.shape[-2:]):
+            height, width = self.input_size.largest
+            wanted = f"[b, 3, {height}, {width}]"
+            if self.input_size.native:
+                step, least = self.input_size.multiple, self.input_size.least
+                wanted = f"[b, 3, H, W], H and W multiples of {step} from {least} to {height}"
+            raise UsageError(f"the model takes images {wanted}, got {[*images.shape]}")
         if chunk is None:
             return self._regions(images)
         if chunk < 1:
             raise UsageError(f"train.encode_chunk {chunk} must be at least 1")
+        grid = self.backbone.grid_of(*images.shape[-2:])
         if any(isinstance(m, GlobalBatchNorm2d) and m.training for m in self.modules()):
             if isinstance(self.backbone, (ResNet, TransVPR)):
                 tokens = self.backbone(images, recompute=True)
@@ -83,11 +102,11 @@ class PlaceModel(nn.Module):
                 assert isinstance(self.backbone, Backbone)  # VGG has no BatchNorm
                 with in_step(self.backbone, chunk):
                     tokens = self.backbone(images)
-            return torch.cat([recomputed(self.pooling, part) for part in tokens.split(chunk)])
+            return torch.cat([recomputed(partial(self.pooling, grid=grid), part) for part in tokens.split(chunk)])
         return torch.cat([recomputed(self._regions, part) for part in images.split(chunk)])
 
     def _regions(self, images: Tensor) -> Tensor:
-        regions: Tensor = self.pooling(self.backbone(images))
+        regions: Tensor = self.pooling(self.backbone(images), self.backbone.grid_of(*images.shape[-2:]))
         return regions
 
     def correlate(self, regions: Tensor, alone: bool = False) -> Tensor:
@@ -135,13 +154,14 @@ class PlaceModel(nn.Module):
             return F.normalize(at_least_float32(related).flatten(1), dim=-1)
 
     def forward(self, images: Tensor, chunk: int | None = None, joint: bool = False) -> Tensor:
-        """`correlate(encode(images, chunk))`: [b, 3, S, S] -> [b, R*D]; `joint`: `correlate_jointly`, [2b, R*D]."""
+        """`correlate(encode(images, chunk))`: [b, 3, H, W] -> [b, R*D]; `joint`: `correlate_jointly`, [2b, R*D]."""
         regions = self.encode(images, chunk)
         return self.correlate_jointly(regions) if joint else self.correlate(regions)
 
 
-def build_model(config: ModelConfig, image_size: int) -> PlaceModel:
-    """The model of a config for square inputs of `image_size` pixels, in train mode, parts frozen as configured.
+def build_model(config: ModelConfig, image_size: int | str) -> PlaceModel:
+    """The model of a config for inputs of `image_size` (224, "480x640", "native"), in train mode, parts frozen as
+    configured.
 
     Random parts are drawn from torch's global generator: seed it first.
 

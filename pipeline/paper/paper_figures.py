@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.common.errors import UsageError
+from pipeline.config.image_size import ImageSize
 from pipeline.evaluation.evaluate import Result
 from pipeline.evaluation.recall import first_hits
 from pipeline.evaluation.report.figures import (
@@ -22,6 +23,7 @@ from pipeline.evaluation.report.figures import (
     INK,
     RED,
     TILE,
+    as_seen,
     canvas,
     caption,
     is_right,
@@ -29,7 +31,6 @@ from pipeline.evaluation.report.figures import (
     metres_text,
     photo_tile,
     short_name,
-    squared,
     usual_aspect,
 )
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
@@ -40,12 +41,16 @@ HUES = ("#3b6fb6", "#e08214", "#1a9850", "#8e5ba6", "#17a2b8", "#b5651d", "#d651
 
 
 def attention_comparison(
-    photos: Sequence[Path], maps: Sequence[tuple[str, np.ndarray]], size: int, path: Path, below: str
+    photos: Sequence[Path],
+    maps: Sequence[tuple[str, Sequence[np.ndarray]]],
+    size: ImageSize,
+    path: Path,
+    below: str,
 ) -> None:
-    """A column a photo: the photo, then one row for each of `maps`, (title, [n, G, G] of `attention_maps`).
+    """A column a photo: the photo, then one row for each of `maps`, (title, n of `attention_maps`).
 
     Each map is spread over its own range, 2nd to 98th percentile, so colours compare within a picture alone. Photos
-    are squared as the model sees them.
+    have the shape in which the model sees them.
     """
     wide, gap, left, head, foot = 1.9, 0.07, 0.34, 0.94, 0.36
     rows = 1 + len(maps)
@@ -57,7 +62,7 @@ def attention_comparison(
             middle = 1 - (head + row * (wide + gap) + wide / 2) / height
             figure.text(0.17 / width, middle, title, rotation=90, ha="center", va="center", fontsize=10.5)
         for column, photo in enumerate(photos):
-            pixels = squared(photo, size)
+            pixels = as_seen(photo, size)
             faded = np.repeat(pixels.mean(2, keepdims=True), 3, axis=2) / 255 * 0.75
             name = short_name(photo, 30)
             middle = left + column * (wide + gap) + wide / 2

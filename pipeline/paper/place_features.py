@@ -131,7 +131,7 @@ def stages(
 
     def described(of: Any, values: torch.Tensor) -> np.ndarray:
         descriptors = torch.empty(len(photos), int(of.descriptor_dim))
-        for group in protocols(config, int(of.image_size), "")[0].form(len(photos), "database"):
+        for group in protocols(config, of.image_size, "")[0].form(len(photos), "database"):
             descriptors[group] = of.correlate(values[group].to(device)).float().cpu()
         return descriptors.numpy()
 

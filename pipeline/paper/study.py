@@ -183,7 +183,7 @@ def _weights(study: Study, base: RunConfig) -> None:
 
 
 _STEPS: dict[object, int] = {}
-_DIMENSIONS: dict[tuple[object, int], int] = {}
+_DIMENSIONS: dict[tuple[object, int | str], int] = {}
 
 
 def _steps_per_epoch(study: Study, config: RunConfig) -> int | None:

@@ -39,7 +39,7 @@ def saved_bytes(model: PlaceModel, images: int, joint: bool = False) -> int:
 
     with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
         device = next(model.parameters()).device
-        keep = model(torch.zeros(images, 3, model.image_size, model.image_size, device=device), joint=joint)
+        keep = model(torch.zeros(images, 3, *model.input_size.largest, device=device), joint=joint)
     del keep
     return sum(seen.values())
 

@@ -18,11 +18,12 @@ from torch import Tensor
 
 from pipeline.common.errors import UsageError
 from pipeline.config import DataConfig, EvaluationConfig, RunConfig
+from pipeline.config.image_size import input_size
 from pipeline.data.images import load_image, to_input
 from pipeline.data.places import VIEWS, Places, members
 from pipeline.data.shard_sets import cache_of
 from pipeline.distributed import agreed, broadcast_tensors, on_rank_0
-from pipeline.evaluation.describe.encode import encode_batch, evaluating
+from pipeline.evaluation.describe.encode import by_shape, encode_parts, evaluating
 from pipeline.evaluation.sets.evaluation_set import list_images
 from pipeline.model.bank import Bank, make_bank
 from pipeline.model.cross_image import check_crossing
@@ -66,8 +67,8 @@ def chosen_bank(
     chosen = [paths[p] for p in drawn(len(paths), config.bank, 0)]
     source = config.bank_from if config.bank_from == "map" else Path(config.bank_from).resolve().name
 
-    def read() -> Tensor:
-        return torch.stack([to_input(load_image(path), model.image_size, config.resize) for path in chosen])
+    def read() -> list[Tensor]:
+        return [to_input(load_image(path), input_size(model), config.resize) for path in chosen]
 
     return encode_bank(model, agreed(read, what="reading the bank"), source, config, device)
 
@@ -81,14 +82,21 @@ def _photos_of_bank(folder: Path) -> list[Path]:
 
 
 def encode_bank(
-    model: PlaceModel, images: Tensor, source: str, config: EvaluationConfig, device: torch.device | str
+    model: PlaceModel,
+    images: Sequence[Tensor] | Tensor,
+    source: str,
+    config: EvaluationConfig,
+    device: torch.device | str,
 ) -> Bank:
-    """The bank of images [M, 3, S, S], as `to_input` gives them or uint8, for a model in `evaluating`. Collective.
+    """The bank of M images [3, H, W], as `to_input` gives them or uint8, for a model in `evaluating`. Collective.
 
     Every rank encodes all of them, which costs less than dealing them out, and takes what rank 0 found.
     """
     dtype = next(model.parameters()).dtype
-    parts = [encode_batch(model.encode, p, config, torch.device(device), dtype) for p in images.split(TOGETHER)]
+    parts = [
+        encode_parts(model, by_shape(images[at : at + TOGETHER]), config, torch.device(device), dtype=dtype)
+        for at in range(0, len(images), TOGETHER)
+    ]
     return make_bank(broadcast_tensors({"regions": torch.cat(parts)})["regions"], source)
 
 
@@ -112,7 +120,7 @@ class TrainingBank:
 
 
 def shard_images(index: ShardIndex, data: DataConfig, wanted: int, seed: int) -> np.ndarray:
-    """View 0 of at most `wanted` places, drawn by `seed`, without augmentation: uint8 [M, 3, S, S].
+    """View 0 of at most `wanted` places, drawn by `seed`, without augmentation: uint8 [M, 3, H, W].
 
     Raises:
         DataError: a shard cannot be read.

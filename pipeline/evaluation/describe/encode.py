@@ -3,11 +3,13 @@
 Invariant: W never changes a descriptor. Forward batches of the per-image part and groups of the cross-image encoder
 are both cut from positions in the dataset, then dealt to ranks whole; a group is always one call of `correlate`, and
 groups of one image are called many together (`calls_of`), cut by position too. So ranks even agree to the last bit on
-like hardware, where cutting batches per rank would leave rounding differences.
+like hardware, where cutting batches per rank would leave rounding differences. Where photos keep their own shapes
+(`image_size: native`), a forward batch goes through shape by shape; regions have one shape, so groups hold any mixture.
 
 The regions [R, D] of an image are computed once and kept (memory, or a file for large sets) by the ranks whose
 groups need them, so that all groupings cost one pass of the backbone. Sharded engines (FSDP2, ZeRO-3) need every
-rank to call the model equally often: a rank without work passes zeros and drops the result.
+rank to call the model equally often: a rank without work passes zeros and drops the result. (Not so with `native`,
+which no training, so no sharded engine, has.)
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from __future__ import annotations
 import contextlib
 import json
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,6 +33,7 @@ from pipeline.common.errors import told
 from pipeline.common.files import replacing, reserve, unnamed_file
 from pipeline.common.progress import Progress
 from pipeline.config import EvaluationConfig
+from pipeline.config.image_size import ImageSize, input_size
 from pipeline.data import workers
 from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.describe.broken import broken_photos
@@ -43,6 +46,8 @@ REGIONS_IN_MEMORY = 4 * 2**30  # bytes of regions a rank keeps in memory before 
 TOLD = 5_000  # images from which the second step, quick beside the backbone, has a progress line of its own
 Block = list[np.ndarray]
 """Consecutive groups that are computed, gathered and stored together."""
+Parts = list[tuple[list[int], Tensor]]
+"""Images of a forward batch by their shape: which rows of the batch, and these images [n, 3, H, W]."""
 
 
 def blocks_of(groups: Sequence[np.ndarray], dim: int, limit: int = BLOCK_BYTES) -> list[Block]:
@@ -69,16 +74,28 @@ def calls_of(protocol: Protocol, images: int, side: Side, model: Any) -> tuple[l
     return protocol.form(images, side, ALONE), True
 
 
-class _Batches(torch.utils.data.Dataset[tuple[Tensor, list[int]]]):
-    """The forward batches of one rank, decoded: item i is ([n, 3, S, S], []) or (nothing, positions of broken ones)."""
+def by_shape(images: Iterable[Tensor]) -> Parts:
+    """Images [3, H, W] of a forward batch, those of one shape together."""
+    shapes: dict[torch.Size, tuple[list[int], list[Tensor]]] = {}
+    for row, image in enumerate(images):
+        rows, alike = shapes.setdefault(image.shape, ([], []))
+        rows.append(row)
+        alike.append(image)
+    return [(rows, torch.stack(alike)) for rows, alike in shapes.values()]
 
-    def __init__(self, paths: Sequence[Path], batches: list[np.ndarray], size: int, resize: Any) -> None:
+
+class _Batches(torch.utils.data.Dataset[tuple[Parts, list[int]]]):
+    """The forward batches of one rank, decoded: item i is (its images, []) or ([], positions of broken ones)."""
+
+    def __init__(
+        self, paths: Sequence[Path], batches: list[np.ndarray], size: int | str | ImageSize, resize: Any
+    ) -> None:
         self.paths, self.batches, self.size, self.resize = paths, batches, size, resize
 
     def __len__(self) -> int:
         return len(self.batches)
 
-    def __getitem__(self, index: int) -> tuple[Tensor, list[int]]:
+    def __getitem__(self, index: int) -> tuple[Parts, list[int]]:
         images, broken = [], []
         for position in self.batches[index].tolist():
             try:
@@ -88,10 +105,10 @@ class _Batches(torch.utils.data.Dataset[tuple[Tensor, list[int]]]):
                     raise
                 broken.append(position)
         if broken:
-            return torch.empty(0), broken
-        batch = torch.stack(images)
-        workers.hand_over(batch)
-        return batch, []
+            return [], broken
+        parts = by_shape(images)
+        workers.hand_over(*(alike for _, alike in parts))
+        return parts, []
 
 
 @dataclass
@@ -144,13 +161,13 @@ def encode(
     """Runs the per-image part over `paths`, each once. Collective.
 
     Args:
-        model: has `encode(images [b, 3, S, S]) -> [b, R, D]`, `regions`, `descriptor_dim` and `image_size`.
+        model: has `encode(images [b, 3, H, W]) -> [b, R, D]`, `regions`, `descriptor_dim` and `image_size`.
         wanted: for each grouping, the blocks that will be correlated; a rank keeps what its groups in them need.
         scratch: folder for the regions of sets too large for memory; None: they lie in a file without a name.
         key: digest of what the regions depend on (`Identity`); a file in `scratch` left by a killed run with the same
             key and batch is continued: its progress is counted in batches.
         beyond: photos that will be described next; where one of `paths` is broken, these are looked through too.
-        fixed: fill the last forward batch up, so that all have `config.batch` images and none rounds otherwise.
+        fixed: fill every call up to `config.batch` images, so that none rounds otherwise.
 
     Raises:
         DataError: images that cannot be read, all of them (`broken_photos`), on all ranks alike.
@@ -168,7 +185,7 @@ def encode(
     steps = -(-len(batches) // w)
     first = min(distributed.gather_uneven(torch.tensor([resume.done], device=device)).tolist())
     own = [batches[step * w + r] for step in range(first, steps) if step * w + r < len(batches)]
-    size = int(model.image_size)  # type: ignore[arg-type]
+    size = input_size(model)
     loader = _loader(_Batches(paths, own, size, config.resize), config.workers)
     total = sum(len(batch) for batch in batches[first * w :])
     problem: BaseException | None = None
@@ -176,14 +193,12 @@ def encode(
     with Progress(label, total, "images", enabled=progress and r == 0) as bar:
         for step in range(first, steps):
             dealt = batches[step * w : (step + 1) * w]
-            images = torch.zeros(1, 3, size, size)
+            parts: Parts = [([0], torch.zeros(1, 3, *size.of_photo(1, 1)))]
             if r < len(dealt) and problem is None:
-                images, broken, problem = _next(loader)
+                parts, broken, problem = _next(loader)
             if distributed.agree(problem, notice=len(broken), what=label):
                 break
-            if fixed:
-                images = F.pad(images, (0, 0, 0, 0, 0, 0, 0, config.batch - len(images)))
-            encoded = encode_batch(model.encode, images, config, device, dtype)  # type: ignore[arg-type]
+            encoded = encode_parts(model, parts, config, device, config.batch if fixed else 0)
             gathered = distributed.gather_uneven(encoded[: len(dealt[r]) if r < len(dealt) else 0])
             try:
                 regions.put(np.concatenate(dealt), gathered.cpu().numpy())
@@ -215,12 +230,12 @@ def _broken(
     return found
 
 
-def _next(loader: Iterator[tuple[Tensor, list[int]]]) -> tuple[Tensor, list[int], BaseException | None]:
+def _next(loader: Iterator[tuple[Parts, list[int]]]) -> tuple[Parts, list[int], BaseException | None]:
     """The next batch, which of its images are broken, or what else is wrong with it."""
     try:
         return *next(loader), None
     except Exception as error:
-        return torch.empty(0), [], error
+        return [], [], error
 
 
 def describe_alone(
@@ -236,9 +251,8 @@ def describe_alone(
     So other photos cannot even change its rounding. `memory`: of a bank (`PlaceModel.remember`), beside which it is
     described; None: in a group of its own. For a model in `evaluating`. Raises `DataError` naming a broken photo.
     """
-    images = to_input(load_image(photo), int(model.image_size), resize)[None]  # type: ignore[arg-type]
-    config = EvaluationConfig(precision=precision)
-    regions = encode_batch(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
+    images = to_input(load_image(photo), input_size(model), resize)[None]
+    regions = encode_parts(model, [([0], images)], EvaluationConfig(precision=precision), device)
     whole: Any = model
     described: Tensor = whole.correlate(regions) if memory is None else whole.correlate_beside(regions, memory)
     numbers: np.ndarray = described.float().cpu().numpy()
@@ -260,17 +274,17 @@ def describe_each(
     For a model in `evaluating`, on one process; nothing is kept. With `config.batch` 1 each is what `describe_alone`
     gives, to the last bit. Raises `DataError` naming the broken images, after what came before the first was given.
     """
-    size, together = int(model.image_size), getattr(model, "correlates_alone", False)  # type: ignore[arg-type]
+    size, together = input_size(model), getattr(model, "correlates_alone", False)
     batches = [np.arange(s, min(s + config.batch, len(paths))) for s in range(0, len(paths), config.batch)]
     loader = _loader(_Batches(paths, batches, size, config.resize), config.workers)
     with Progress(label, len(paths), "images", enabled=progress) as bar:
         left = iter(loader)
         for batch in batches:
-            images, broken = next(left)
+            parts, broken = next(left)
             if broken:
                 found = _broken(label, broken, left, iter(()), len(paths), progress)
                 raise broken_photos(paths, found, label)
-            regions = encode_batch(model.encode, images, config, device, _dtype(model))  # type: ignore[arg-type]
+            regions = encode_parts(model, parts, config, device)
             if memory is not None:
                 described = model.correlate_beside(regions, memory)  # type: ignore[operator]
             elif together and len(batch) > 1:
@@ -325,6 +339,24 @@ def correlate(
             bar.advance(sum(len(group) for group in block))
 
 
+def encode_parts(
+    model: Any, parts: Parts, config: EvaluationConfig, device: torch.device, filled: int = 0, dtype: Any = None
+) -> Tensor:
+    """Regions [n, R, D] of a forward batch in the order of its rows.
+
+    `filled`: each call is filled with zeros to so many images; `dtype`: of the regions, none: float32, or float64 for a
+    model in it.
+    """
+    found = []
+    for rows, images in parts:
+        whole = F.pad(images, (0, 0, 0, 0, 0, 0, 0, filled - len(images))) if filled else images
+        found.append(encode_batch(model.encode, whole, config, device, dtype or _dtype(model))[: len(rows)])
+    if len(found) == 1:
+        return found[0]
+    order = torch.tensor([row for rows, _ in parts for row in rows], device=found[0].device)
+    return torch.cat(found)[order.argsort()]
+
+
 def encode_batch(
     encode: Callable[[Tensor], Tensor], images: Tensor, config: EvaluationConfig, device: torch.device, dtype: Any
 ) -> Tensor:
@@ -353,7 +385,7 @@ def _zeros(shape: tuple[int, ...], dtype: Any) -> Tensor:
     return torch.from_numpy(np.zeros((1, *shape), dtype))
 
 
-def _loader(dataset: _Batches, processes: int) -> Iterator[tuple[Tensor, list[int]]]:
+def _loader(dataset: _Batches, processes: int) -> Iterator[tuple[Parts, list[int]]]:
     """Whole batches in order. Its own generator: a validation must not advance the training's random state."""
     processes = min(processes, len(dataset)) if len(dataset) > 1 else 0
     options = workers.options(processes, prefetch=2)

@@ -6,7 +6,6 @@ with a sign beside the colour for those who do not see it. Files are drawn witho
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,7 +17,9 @@ import numpy as np
 
 from pipeline.common.files import naming
 from pipeline.common.text import printable
+from pipeline.config.image_size import ImageSize, input_size
 from pipeline.data.images import load_image, normalise, to_input
+from pipeline.evaluation.describe.encode import by_shape
 from pipeline.evaluation.evaluate import Result
 from pipeline.evaluation.recall import first_hits
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
@@ -296,28 +297,31 @@ def curve_of(evaluated: EvaluationSet, result: Result) -> np.ndarray:
     return 100.0 * within.mean(axis=0)
 
 
-def attention_maps(model: Any, photos: Sequence[Path]) -> np.ndarray:
-    """Channel means of the patch tokens of photos (paper, Fig. 1): float32 [n, G, G].
+def attention_maps(model: Any, photos: Sequence[Path]) -> list[np.ndarray]:
+    """Channel means of the patch tokens of photos (paper, Fig. 1): for each float32 [h, w].
 
-    `model.backbone(images [n, 3, S, S]) -> [n, 1 + G*G, D]`, in eval mode, on any device.
+    `model.backbone(images [n, 3, H, W]) -> [n, 1 + h*w, D]`, in eval mode, on any device.
     """
     import torch
 
-    inputs = torch.stack([to_input(load_image(photo), int(model.image_size)) for photo in photos])
-    with torch.no_grad():
-        tokens = model.backbone(normalise(inputs.to(next(model.parameters()).device))).float().cpu()
-    side = math.isqrt(tokens.shape[1] - 1)
-    return np.asarray(tokens[:, 1:].mean(-1).reshape(-1, side, side).numpy())
+    maps: dict[int, np.ndarray] = {}
+    device, size = next(model.parameters()).device, input_size(model)
+    for rows, images in by_shape(to_input(load_image(photo), size) for photo in photos):
+        with torch.no_grad():
+            tokens = model.backbone(normalise(images.to(device))).float().cpu()
+        grid = model.backbone.grid_of(*images.shape[-2:])
+        maps |= zip(rows, tokens[:, 1:].mean(-1).unflatten(1, grid).numpy(), strict=True)
+    return [maps[row] for row in range(len(photos))]
 
 
 def attention_overlay(model: Any, photos: Sequence[Path], path: Path, title: str) -> None:
     """Photos above their `attention_maps`, each map scaled to its own range."""
-    maps, size = attention_maps(model, photos), int(model.image_size)
+    maps, size = attention_maps(model, photos), input_size(model)
     with canvas(2.0 * len(photos), 4.55, path) as figure:
         figure.suptitle(title, x=0.008, ha="left", fontsize=13, fontweight="bold")
         axes = figure.subplots(2, len(photos), squeeze=False)
         for i, photo in enumerate(photos):
-            pixels = squared(photo, size)
+            pixels = as_seen(photo, size)
             axes[0, i].imshow(pixels)
             axes[0, i].set_title(short_name(photo), fontsize=8, fontweight="normal", loc="center")
             lay_over(axes[1, i], pixels, maps[i], alpha=0.65)
@@ -325,14 +329,19 @@ def attention_overlay(model: Any, photos: Sequence[Path], path: Path, title: str
                 ax.axis("off")
 
 
-def squared(photo: Path, size: int) -> np.ndarray:
-    """A photo squared as a model of input side `size` sees it, in at least 224 pixels: uint8 [S, S, 3]."""
-    return np.asarray(to_input(load_image(photo), max(size, 224)).permute(1, 2, 0).numpy())
+def as_seen(photo: Path, size: ImageSize) -> np.ndarray:
+    """A photo in the shape in which a model sees it, its longest side of at least 224 pixels: uint8 [H, W, 3]."""
+    image = load_image(photo)
+    shape = size.of_photo(image.height, image.width)
+    larger = max(1.0, 224 / max(shape))
+    height, width = (round(side * larger) for side in shape)
+    return np.asarray(to_input(image, ImageSize(height, width)).permute(1, 2, 0).numpy())
 
 
 def lay_over(axes: Any, pixels: np.ndarray, heat: np.ndarray, **style: Any) -> None:
-    """A map [G, G] over the photo [S, S, 3] that it is of: both fill the same square, whatever their sizes."""
-    whole = (0, 1, 1, 0)
+    """A map [h, w] over the photo [H, W, 3] that it is of: both fill the photo's shape, whatever their sizes."""
+    height, width = np.array(pixels.shape[:2]) / max(pixels.shape[:2])
+    whole = (0, width, height, 0)
     axes.imshow(pixels, extent=whole)
     axes.imshow(heat, extent=whole, cmap="inferno", **{"interpolation": "bicubic", **style})
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from pipeline.common.errors import UsageError
 from pipeline.config.baselines import BoQConfig
+from pipeline.model.pooling import Grid
 
 
 class Block(nn.Module):
@@ -35,13 +36,15 @@ class Block(nn.Module):
 
 
 class BoQ(nn.Module):
-    """Tokens [b, 1 + G*G, D] -> [b, 1, channels * rows].
+    """Tokens [b, 1 + h*w, D] -> [b, 1, channels * rows].
 
     Raises:
         UsageError: channels that heads of 64 do not divide.
     """
 
-    def __init__(self, config: BoQConfig, dim: int, grid: int) -> None:
+    least = 1
+
+    def __init__(self, config: BoQConfig, dim: int, grid: Grid) -> None:
         super().__init__()
         if config.channels % 64:
             raise UsageError(f"pooling.boq.channels {config.channels} is not a multiple of 64, the width of a head")
@@ -53,9 +56,9 @@ class BoQ(nn.Module):
         )
         self.fc = nn.Linear(config.layers * config.queries, config.rows)
 
-    def forward(self, tokens: Tensor) -> Tensor:
-        """[b, 1 + G*G, D] -> [b, 1, channels * rows]."""
-        patches = tokens[:, 1:].transpose(1, 2).unflatten(2, (self.grid, self.grid))
+    def forward(self, tokens: Tensor, grid: Grid | None = None) -> Tensor:
+        """[b, 1 + h*w, D] -> [b, 1, channels * rows]; `grid`: where it is another than the one it was built for."""
+        patches = tokens[:, 1:].transpose(1, 2).unflatten(2, grid or self.grid)
         x = self.norm_input(self.proj_c(patches).flatten(2).transpose(1, 2))
         answers = []
         for block in self.boqs:

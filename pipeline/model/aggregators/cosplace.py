@@ -10,11 +10,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pipeline.config.baselines import CosPlaceConfig
-from pipeline.model.pooling import at_least_float32
+from pipeline.model.pooling import Grid, at_least_float32
 
 
 class CosPlace(nn.Module):
     """Tokens [b, 1 + N, D] -> [b, 1, dim]."""
+
+    least = 1
 
     def __init__(self, config: CosPlaceConfig, channels: int, p: float) -> None:
         super().__init__()
@@ -22,7 +24,7 @@ class CosPlace(nn.Module):
         self.p = nn.Parameter(torch.full((1,), float(p)))
         self.fc = nn.Linear(channels, config.dim)
 
-    def forward(self, tokens: Tensor) -> Tensor:
+    def forward(self, tokens: Tensor, grid: Grid | None = None) -> Tensor:
         """[b, 1 + N, D] -> [b, 1, dim]."""
         with torch.autocast(tokens.device.type, enabled=False):
             p = at_least_float32(self.p)

@@ -1,6 +1,6 @@
 """MixVPR (Ali-bey et al., WACV 2023): every channel's map is mixed over positions, then projected twice.
 
-Invariant: unlike the other aggregators its weights belong to one number of positions, so to one input size.
+Invariant: unlike the other aggregators its weights belong to one grid of positions, so to one input size.
 Parameters are named as in the release.
 """
 
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.config.baselines import MixVPRConfig
+from pipeline.model.pooling import Grid
 
 
 class Mixer(nn.Module):
@@ -33,17 +34,20 @@ class Mixer(nn.Module):
 
 
 class MixVPR(nn.Module):
-    """Tokens [b, 1 + G*G, D] -> [b, 1, channels * rows]."""
+    """Tokens [b, 1 + h*w, D] -> [b, 1, channels * rows]."""
 
-    def __init__(self, config: MixVPRConfig, channels: int, grid: int) -> None:
+    least = None
+
+    def __init__(self, config: MixVPRConfig, channels: int, grid: Grid) -> None:
         super().__init__()
+        positions = grid[0] * grid[1]
         self.regions, self.dim = 1, config.channels * config.rows
-        self.mix = nn.Sequential(*(Mixer(grid * grid, config.mlp_ratio) for _ in range(config.depth)))
+        self.mix = nn.Sequential(*(Mixer(positions, config.mlp_ratio) for _ in range(config.depth)))
         self.channel_proj = nn.Linear(channels, config.channels)
-        self.row_proj = nn.Linear(grid * grid, config.rows)
+        self.row_proj = nn.Linear(positions, config.rows)
 
-    def forward(self, tokens: Tensor) -> Tensor:
-        """[b, 1 + G*G, D] -> [b, 1, channels * rows]."""
+    def forward(self, tokens: Tensor, grid: Grid | None = None) -> Tensor:
+        """[b, 1 + h*w, D] -> [b, 1, channels * rows]."""
         mixed = self.mix(tokens[:, 1:].transpose(1, 2))  # [b, D, N]
         projected = self.channel_proj(mixed.transpose(1, 2)).transpose(1, 2)
         rows: Tensor = self.row_proj(projected)

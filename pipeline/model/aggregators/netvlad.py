@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pipeline.config.baselines import NetVLADConfig
-from pipeline.model.pooling import at_least_float32
+from pipeline.model.pooling import Grid, at_least_float32
 
 
 class NetVLAD(nn.Module):
@@ -23,6 +23,8 @@ class NetVLAD(nn.Module):
     Each is a region of its own: the cross-image encoder may follow. The centres should be set by `cluster` before
     training; without, they are random.
     """
+
+    least = 1
 
     def __init__(self, config: NetVLADConfig, dim: int) -> None:
         super().__init__()
@@ -41,7 +43,7 @@ class NetVLAD(nn.Module):
         bias = None if self.conv.bias is None else self.conv.bias.to(x.dtype)
         return x, F.linear(x, weight, bias).softmax(dim=-1), centres
 
-    def forward(self, tokens: Tensor) -> Tensor:
+    def forward(self, tokens: Tensor, grid: Grid | None = None) -> Tensor:
         """[b, 1 + N, D] -> [b, K, D], or [b, 1, D'] with a projection."""
         with torch.autocast(tokens.device.type, enabled=False):
             x, assigned, centres = self._assigned(tokens)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from pipeline.common.errors import UsageError
 from pipeline.config.baselines import SALADConfig
-from pipeline.model.pooling import at_least_float32
+from pipeline.model.pooling import Grid, at_least_float32
 
 
 def transport(scores: Tensor, dustbin: Tensor, iterations: int) -> Tensor:
@@ -35,19 +35,21 @@ def transport(scores: Tensor, dustbin: Tensor, iterations: int) -> Tensor:
 
 
 class SALAD(nn.Module):
-    """Tokens [b, 1 + G*G, D] -> [b, 1, token + channels * clusters].
+    """Tokens [b, 1 + h*w, D] -> [b, 1, token + channels * clusters].
 
     Raises:
         UsageError: not fewer clusters than patches: the dustbin would have nothing to take.
     """
 
-    def __init__(self, config: SALADConfig, dim: int, grid: int) -> None:
+    def __init__(self, config: SALADConfig, dim: int, grid: Grid) -> None:
         super().__init__()
-        if config.clusters >= grid * grid:
+        patches = grid[0] * grid[1]
+        if config.clusters >= patches:
             raise UsageError(
-                f"pooling.salad.clusters {config.clusters} must be fewer than the {grid * grid} patches of an image; "
-                "take fewer clusters or a larger data.image_size"
+                f"pooling.salad.clusters {config.clusters} must be fewer than the {patches} patches of an image; "
+                "take fewer clusters or a larger image_size"
             )
+        self.least = math.isqrt(config.clusters) + 1
         self.regions, self.dim, self.iterations = 1, config.token + config.channels * config.clusters, config.iterations
         self.token_features = nn.Sequential(
             nn.Linear(dim, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.token)
@@ -62,8 +64,8 @@ class SALAD(nn.Module):
         dropout = nn.Dropout(config.dropout) if config.dropout > 0 else nn.Identity()
         return nn.Sequential(nn.Conv2d(dim, config.hidden, 1), dropout, nn.ReLU(), nn.Conv2d(config.hidden, out, 1))
 
-    def forward(self, tokens: Tensor) -> Tensor:
-        """[b, 1 + G*G, D] -> [b, 1, token + channels * clusters]."""
+    def forward(self, tokens: Tensor, grid: Grid | None = None) -> Tensor:
+        """[b, 1 + h*w, D] -> [b, 1, token + channels * clusters]."""
         patches = tokens[:, 1:].transpose(1, 2).unsqueeze(-1)  # [b, D, N, 1]: 1x1 convolutions need no grid
         features = at_least_float32(self.cluster_features(patches).squeeze(-1))  # [b, channels, N]
         scores = at_least_float32(self.score(patches).squeeze(-1))  # [b, clusters, N]

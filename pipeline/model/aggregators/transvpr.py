@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from pipeline.common.errors import UsageError
 from pipeline.config.baselines import AttentionMapsConfig
-from pipeline.model.pooling import at_least_float32
+from pipeline.model.pooling import Grid, at_least_float32
 
 
 class AttentionMaps(nn.Module):
@@ -21,6 +21,8 @@ class AttentionMaps(nn.Module):
     Raises:
         UsageError: a token does not have so many levels.
     """
+
+    least = 1
 
     def __init__(self, config: AttentionMapsConfig, channels: int) -> None:
         super().__init__()
@@ -36,7 +38,7 @@ class AttentionMaps(nn.Module):
         scores: Tensor = F.linear(x, self.attention_pool.weight.to(x.dtype), self.attention_pool.bias.to(x.dtype))
         return scores.softmax(1).transpose(1, 2)
 
-    def forward(self, tokens: Tensor) -> Tensor:
+    def forward(self, tokens: Tensor, grid: Grid | None = None) -> Tensor:
         """[b, 1 + N, L * D] -> [b, 1, D]."""
         with torch.autocast(tokens.device.type, enabled=False):
             levels = at_least_float32(tokens[:, 1:]).unflatten(-1, (self.levels, self.dim))

@@ -18,7 +18,9 @@ from torch.utils.checkpoint import checkpoint
 from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig
 from pipeline.config.baselines import ResNetConfig
+from pipeline.config.image_size import ImageSize
 from pipeline.model.batch_norm import GlobalBatchNorm2d
+from pipeline.model.pooling import Grid
 
 STAGES: dict[str, tuple[int, ...]] = {
     "resnet18": (2, 2, 2, 2),
@@ -118,9 +120,14 @@ class ResNet(nn.Module):
 
     `train` of the model's config: full; frozen; last with `last_blocks` counting stages from the end.
 
+    Attributes:
+        size: of the input.
+        grid: rows h and columns w of the patches, of the largest input where its size varies.
+        stride: pixels from patch to patch.
+
     Args:
         config: the model's config; used are its backbone and what of it is trained.
-        image_size: side of the input in pixels; any.
+        image_size: of the input; any.
 
     Raises:
         UsageError: adapters (they belong to transformer blocks), more last stages than there are, weights that do not
@@ -131,7 +138,7 @@ class ResNet(nn.Module):
     deviation: Tensor
     keras_means: Tensor
 
-    def __init__(self, config: ModelConfig, image_size: int) -> None:
+    def __init__(self, config: ModelConfig, image_size: int | str | ImageSize) -> None:
         super().__init__()
         settings, backbone = config.backbone.resnet, config.backbone
         self.layout = settings.layout
@@ -143,9 +150,9 @@ class ResNet(nn.Module):
         shape = (1, 3, 1, 1)
         for name, values in (("mean", MEAN), ("deviation", DEVIATION), ("keras_means", KERAS_MEANS)):
             self.register_buffer(name, torch.tensor(values, device="cpu").view(shape), persistent=False)
-        self.grid = image_size
-        for _ in range(self.depth + 1):  # the first convolution, its pooling, and each stage but the first halve
-            self.grid = (self.grid + 1) // 2
+        self.size = ImageSize.of(image_size)
+        self.grid = self.grid_of(*self.size.largest)
+        self.stride = 2 ** (self.depth + 1)
         if backbone.weights:
             from pipeline.model.weights.pretrained import load_resnet
 
@@ -191,6 +198,11 @@ class ResNet(nn.Module):
         for module in self._frozen():
             module.eval()
         return self
+
+    def grid_of(self, height: int, width: int, layer: int | None = None) -> Grid:
+        """Rows and columns of the patches of an input after stage `layer`; None: the last one used."""
+        halvings = (layer or self.depth) + 1  # the first convolution, its pooling, and each stage but the first
+        return -(-height // 2**halvings), -(-width // 2**halvings)
 
     def adapters(self) -> list[nn.Module]:
         """None: the counterpart of the transformers' adapters."""

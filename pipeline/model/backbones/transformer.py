@@ -1,7 +1,7 @@
 """The image encoder: the transformers library's DINOv2 or DINOv3 with adapters beside the MLP of every block.
 
 Invariant: the stored position embedding stays the parameter it was released as; what the tokens get added is its
-resize to the input's grid, made once where the embedding is frozen and in every forward where it is trained, so
+resize to the input's grid, made once a grid where the embedding is frozen and in every forward where it is trained, so
 the library never interpolates at run time. The mask token of the released weights is kept, frozen and unused, so
 that parameter counts are those of the released model. Register tokens take part inside and never come out. DINOv3
 has rotary positions instead of an embedding, which its library computes from the image's size.
@@ -21,7 +21,9 @@ from torch import Tensor, nn
 
 from pipeline.common.errors import UsageError
 from pipeline.config import BackboneConfig, ModelConfig
-from pipeline.model.adapters import AdaptedMLP, build_adapter
+from pipeline.config.image_size import ImageSize, for_patch
+from pipeline.model.adapters import AdaptedMLP, ConvAdapter, build_adapter
+from pipeline.model.pooling import Grid
 
 
 @dataclass(frozen=True)
@@ -75,24 +77,24 @@ def sizes(config: BackboneConfig) -> Sizes:
     )
 
 
-def resize_positions(stored: Tensor, grid: int, registers: bool = False) -> Tensor:
-    """The position embedding on another grid, as DINOv2 resizes it: [1, 1 + S*S, D] -> [1, 1 + grid*grid, D].
+def resize_positions(stored: Tensor, grid: Grid, registers: bool = False) -> Tensor:
+    """The position embedding on another grid of h x w tokens, as DINOv2 resizes it: [1, 1 + S*S, D] -> [1, 1 + h*w, D].
 
-    Bicubic without antialias, `align_corners=False`, with the scale (grid + 0.1) / S rather than the size: the
-    offset is DINOv2's guard against rounding, and it shifts the sampling points, so it belongs to the weights.
+    Bicubic without antialias, `align_corners=False`, with the scales (h + 0.1) / S and (w + 0.1) / S rather than the
+    size: the offset is DINOv2's guard against rounding, and it shifts the sampling points: it belongs to the weights.
     The variants with registers were released with antialias and without the offset. In float32, like the published
     code; a trained float64 embedding stays float64 so its gradient loses no digits.
     """
     side = round((stored.shape[1] - 1) ** 0.5)
-    if side == grid:
+    if grid == (side, side):
         return stored
     precise = torch.float64 if stored.dtype == torch.float64 and stored.requires_grad else torch.float32
     patches = stored[:, 1:].to(precise).reshape(1, side, side, -1).permute(0, 3, 1, 2)
     if registers:
-        patches = F.interpolate(patches, size=(grid, grid), mode="bicubic", align_corners=False, antialias=True)
+        patches = F.interpolate(patches, size=grid, mode="bicubic", align_corners=False, antialias=True)
     else:
-        scale = (grid + 0.1) / side
-        patches = F.interpolate(patches, scale_factor=(scale, scale), mode="bicubic", align_corners=False)
+        scale = ((grid[0] + 0.1) / side, (grid[1] + 0.1) / side)
+        patches = F.interpolate(patches, scale_factor=scale, mode="bicubic", align_corners=False)
     patches = patches.permute(0, 2, 3, 1).flatten(1, 2).to(stored.dtype)
     return torch.cat((stored[:, :1], patches), dim=1)
 
@@ -100,7 +102,7 @@ def resize_positions(stored: Tensor, grid: int, registers: bool = False) -> Tens
 class Embeddings(nn.Module):
     """Class token, registers, patch projection, position embedding; takes the place of the library's embeddings."""
 
-    def __init__(self, library: nn.Module, grid: int, registers: int = 0) -> None:
+    def __init__(self, library: nn.Module, grid: Grid, registers: int = 0) -> None:
         super().__init__()
         self.grid = grid
         self.cls_token: nn.Parameter = library.cls_token  # type: ignore[assignment]
@@ -117,12 +119,12 @@ class Embeddings(nn.Module):
 
     @torch.no_grad()
     def refresh(self) -> None:
-        """Resizes the stored embedding anew; called when weights were loaded."""
+        """Resizes the stored embedding anew; called when weights were loaded, or `grid` was changed."""
         frozen = self.position_embeddings.detach()
         self.resized = resize_positions(frozen, self.grid, self.register_tokens is not None)
 
     def forward(self, pixel_values: Tensor, **_: Any) -> Tensor:
-        """[b, 3, S, S] -> [b, 1 + registers + G*G, D]; registers get no position."""
+        """[b, 3, H, W] -> [b, 1 + registers + h*w, D]; registers get no position."""
         patches = self.patch_embeddings(pixel_values)
         positions = self.resized
         if self.position_embeddings.requires_grad:
@@ -134,26 +136,30 @@ class Embeddings(nn.Module):
 
 
 class Backbone(nn.Module):
-    """DINOv2 or DINOv3 with adapters: [b, 3, S, S] normalised images -> [b, 1 + G*G, D] tokens after the final norm
+    """DINOv2 or DINOv3 with adapters: [b, 3, H, W] normalised images -> [b, 1 + h*w, D] tokens after the final norm
     (or before it, `final_norm: false`).
+
+    Attributes:
+        size: of the input.
+        grid: rows h and columns w of the patch tokens, of the last input where its size varies.
+        stride: the patch, in pixels.
 
     Args:
         config: the model's config; used are its backbone, its adapter, and what of them is trained.
-        image_size: side of the input in pixels, a multiple of the patch.
+        image_size: of the input; its sides are multiples of the patch.
 
     Raises:
         UsageError: an input size that is no multiple of the patch, weights that do not fit, an attention
             implementation that is not installed, more last blocks than there are.
     """
 
-    def __init__(self, config: ModelConfig, image_size: int) -> None:
+    def __init__(self, config: ModelConfig, image_size: int | str | ImageSize) -> None:
         super().__init__()
         size = sizes(config.backbone)
-        if image_size % size.patch or image_size < size.patch:
-            raise UsageError(f"data.image_size {image_size} is not a multiple of the backbone's patch {size.patch}")
+        self.size, self.stride = for_patch(ImageSize.of(image_size), size.patch, config.backbone.name), size.patch
         if config.trainable == "last" and not 1 <= config.last_blocks <= size.depth:
             raise UsageError(f"model.last_blocks {config.last_blocks} must lie between 1 and the depth {size.depth}")
-        self.dim, self.depth, self.grid = size.dim, size.depth, image_size // size.patch
+        self.dim, self.depth, self.grid = size.dim, size.depth, self.grid_of(*self.size.largest)
         self.registers, self.rope, self.final_norm = size.registers, size.rope, config.backbone.final_norm
         weights = config.backbone.weights
         # with released weights the random start would only cost time: shapes first, tensors from the file
@@ -186,7 +192,7 @@ class Backbone(nn.Module):
                 module.requires_grad_(True)
         if config.adapter.kind != "none":
             for block in self.blocks[self.depth - last :]:
-                adapter = build_adapter(config.adapter, self.dim, 1 + self.registers)
+                adapter = build_adapter(config.adapter, self.dim, self.grid, 1 + self.registers)
                 block.mlp = AdaptedMLP(block.mlp, adapter, config.adapter.scale)
 
     @property
@@ -200,8 +206,25 @@ class Backbone(nn.Module):
         """The adapters in block order; empty without adapters."""
         return [block.mlp.adapter for block in self.blocks if isinstance(block.mlp, AdaptedMLP)]
 
+    def grid_of(self, height: int, width: int, layer: int | None = None) -> Grid:
+        """Rows and columns of the patch tokens of an input, after every block the same."""
+        return height // self.stride, width // self.stride
+
+    def _on(self, images: Tensor) -> None:
+        """Brings positions and adapters to the images' grid, where it is another than that of the images before."""
+        grid = self.grid_of(*images.shape[-2:])
+        if grid == self.grid:
+            return
+        self.grid = grid
+        for adapter in self.adapters():
+            if isinstance(adapter, ConvAdapter):
+                adapter.grid = grid
+        if not self.rope:
+            self.vit.embeddings.grid = grid
+            self.vit.embeddings.refresh()
+
     def patches(self, images: Tensor, layer: int | None = None) -> Tensor:
-        """[b, 3, S, S] -> [b, G*G, D] patch tokens after block `layer` (1 is the first), under the final norm.
+        """[b, 3, H, W] -> [b, h*w, D] patch tokens after block `layer` (1 is the first), under the final norm.
 
         Args:
             layer: None takes the last, which is `forward` without its class token.
@@ -213,6 +236,7 @@ class Backbone(nn.Module):
             return self(images)[:, 1:]
         if not 1 <= layer <= self.depth:
             raise UsageError(f"layer {layer}: the backbone's blocks are 1 to {self.depth}")
+        self._on(images)
         found: list[Tensor] = []
 
         def keep(_: nn.Module, __: Any, output: Any) -> None:
@@ -228,7 +252,8 @@ class Backbone(nn.Module):
         return tokens[:, 1 + self.registers :]
 
     def forward(self, images: Tensor) -> Tensor:
-        """[b, 3, S, S] -> [b, 1 + G*G, D]: class token first, then patches row by row."""
+        """[b, 3, H, W] -> [b, 1 + h*w, D]: class token first, then patches row by row."""
+        self._on(images)
         tokens: Tensor = self.vit(pixel_values=images).last_hidden_state
         if not self.registers:
             return tokens

@@ -18,8 +18,10 @@ from torch.utils.checkpoint import checkpoint
 from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig
 from pipeline.config.baselines import TransVPRConfig
+from pipeline.config.image_size import ImageSize, for_patch
 from pipeline.model.backbones.resnet import check_trained
 from pipeline.model.batch_norm import GlobalBatchNorm2d
+from pipeline.model.pooling import Grid
 
 PATCH = 16  # pixels: four stages halve the image, and each stage gives the tokens a quarter of their channels
 
@@ -86,20 +88,24 @@ class TransVPR(nn.Module):
     `train` of the model's config: full; frozen; last with `last_blocks` counting transformer blocks from the end, which
     leaves the stem frozen.
 
+    Attributes:
+        size: of the input.
+        grid: rows h and columns w of the patches, of the largest input where its size varies.
+        stride: the patch, in pixels.
+
     Args:
         config: the model's config; used are its backbone and what of it is trained.
-        image_size: side of the input in pixels, a multiple of 16.
+        image_size: of the input; its sides are multiples of 16.
 
     Raises:
         UsageError: adapters, more last blocks than there are, weights of a backbone alone (there are none), sizes that
             do not fit each other.
     """
 
-    def __init__(self, config: ModelConfig, image_size: int) -> None:
+    def __init__(self, config: ModelConfig, image_size: int | str | ImageSize) -> None:
         super().__init__()
         settings = config.backbone.transvpr
-        if image_size % PATCH:
-            raise UsageError(f"data.image_size {image_size} is not a multiple of the backbone's patch {PATCH}")
+        self.size, self.stride = for_patch(ImageSize.of(image_size), PATCH, config.backbone.name), PATCH
         if config.backbone.weights:
             raise UsageError(
                 "model.backbone.weights: TransVPR's release is a whole model; import it with jobs.weights instead"
@@ -110,7 +116,7 @@ class TransVPR(nn.Module):
                 f"{settings.levels} lie within the {settings.depth} blocks"
             )
         check_trained(config, settings.depth)
-        self.depth, self.levels, self.grid = settings.depth, settings.levels, image_size // PATCH
+        self.depth, self.levels, self.grid = settings.depth, settings.levels, self.grid_of(*self.size.largest)
         self.dim = len(settings.levels) * settings.dim
         channels = 3
         for i in range(4):
@@ -152,6 +158,10 @@ class TransVPR(nn.Module):
             for module in (*still, *self.blocks[: self.depth - self.trained]):
                 module.eval()
         return self
+
+    def grid_of(self, height: int, width: int, layer: int | None = None) -> Grid:
+        """Rows and columns of the patches of an input, after every block the same."""
+        return height // PATCH, width // PATCH
 
     def adapters(self) -> list[nn.Module]:
         """None: the counterpart of the transformers' adapters."""

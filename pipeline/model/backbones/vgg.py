@@ -8,6 +8,7 @@ another.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 
 import torch
 import torch.nn.functional as F
@@ -15,7 +16,9 @@ from torch import Tensor, nn
 
 from pipeline.common.errors import UsageError
 from pipeline.config import ModelConfig
+from pipeline.config.image_size import ImageSize
 from pipeline.model.backbones.resnet import DEVIATION, MEAN, check_trained
+from pipeline.model.pooling import Grid
 
 # channels and number of the 3x3 convolutions of each stage; stages are parted by 2x2 max pooling
 STAGES = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
@@ -43,9 +46,14 @@ class VGG(nn.Module):
 
     `train` of the model's config: full; frozen; last with `last_blocks` counting stages from the end.
 
+    Attributes:
+        size: of the input.
+        grid: rows h and columns w of the patches, of the largest input where its size varies.
+        stride: pixels from patch to patch.
+
     Args:
         config: the model's config; used are its backbone and what of it is trained.
-        image_size: side of the input in pixels; any from the backbone's stride (16 or 32) on.
+        image_size: of the input; sides of at least the backbone's stride (16 or 32).
 
     Raises:
         UsageError: adapters (they belong to transformer blocks), more last stages than there are, an input smaller
@@ -56,15 +64,18 @@ class VGG(nn.Module):
     deviation: Tensor
     matconvnet_means: Tensor
 
-    def __init__(self, config: ModelConfig, image_size: int) -> None:
+    def __init__(self, config: ModelConfig, image_size: int | str | ImageSize) -> None:
         super().__init__()
         settings, backbone = config.backbone.vgg, config.backbone
         self.dim, self.depth = STAGES[-1][0], len(STAGES)
         check_trained(config, self.depth)
         self.layout, self.pool_last = settings.layout, settings.cut == "pool5"
-        self.grid = image_size // (32 if self.pool_last else 16)
-        if self.grid < 1:
-            raise UsageError(f"data.image_size {image_size} is smaller than one patch of backbone {backbone.name}")
+        self.stride = 32 if self.pool_last else 16
+        size = ImageSize.of(image_size)
+        self.size = dataclasses.replace(size, least=max(size.least, self.stride))
+        self.grid = self.grid_of(*self.size.largest)
+        if min(size.height, size.width) < self.stride:
+            raise UsageError(f"image_size {size.setting} is smaller than a patch of backbone {backbone.name}")
         channels = 3
         with torch.device("meta") if backbone.weights else contextlib.nullcontext():
             for i, (width, count) in enumerate(STAGES, 1):
@@ -89,6 +100,11 @@ class VGG(nn.Module):
     def blocks(self) -> list[nn.Module]:
         """The stages in order."""
         return [self.get_submodule(f"stage{i + 1}") for i in range(self.depth)]
+
+    def grid_of(self, height: int, width: int, layer: int | None = None) -> Grid:
+        """Rows and columns of the patches of an input after stage `layer`, before its pooling; None: the last."""
+        halvings = 5 if self.pool_last and layer in (None, self.depth) else (layer or self.depth) - 1
+        return height // 2**halvings, width // 2**halvings
 
     def adapters(self) -> list[nn.Module]:
         """None: the counterpart of the transformers' adapters."""

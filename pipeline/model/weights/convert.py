@@ -22,13 +22,14 @@ from pipeline.model.bank import bank_beside, save_bank
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.files import (
     PUBLISHED_SIZE,
+    at_size,
     checkpoint_file,
     from_published,
     load_model,
     read_metadata,
     save_model,
 )
-from pipeline.model.weights.names import fit, to_published
+from pipeline.model.weights.names import to_published
 from pipeline.model.weights.pretrained import backbone_tensors, dinov3_tensors, read_tensors
 from pipeline.model.weights.released import RELEASES, from_release, recognise
 
@@ -61,21 +62,21 @@ def _kind(tensors: Mapping[str, Tensor]) -> str:
     return "cricavpr" if published else "backbone"
 
 
-def read_model(source: str, kind: str, config: ModelConfig, image_size: int | None) -> PlaceModel:
+def read_model(source: str, kind: str, config: ModelConfig, image_size: int | str | None) -> PlaceModel:
     """A whole model in eval mode: one of ours, a released CricaVPR, or a release of another method.
 
     Args:
         source: a run or checkpoint folder or file of ours; a .pth or safetensors file of published names.
         kind: "model", "cricavpr" or one of RELEASES.
         config: sizes of the published CricaVPR; all others say their own.
-        image_size: side of the input in pixels; none: what the file says, else the method's own (CricaVPR: 224).
+        image_size: of the input; none: what the file says, else that of the method's own evaluation (CricaVPR: 224).
 
     Raises:
         UsageError: nothing there, another kind, names or shapes that do not fit; DataError: broken.
     """
     if kind == "model":
         model = load_model(Path(source).expanduser())
-        return model if image_size in (None, model.image_size) else at_size(model, image_size or 0)
+        return model if image_size is None else at_size(model, image_size)
     tensors = read_tensors(source)
     if kind in RELEASES:
         return from_release(tensors, source, kind, image_size)
@@ -84,7 +85,7 @@ def read_model(source: str, kind: str, config: ModelConfig, image_size: int | No
     return from_published(tensors, source, image_size or PUBLISHED_SIZE, config)
 
 
-def read_whole(path: str, image_size: int | None) -> PlaceModel:
+def read_whole(path: str, image_size: int | str | None) -> PlaceModel:
     """`read_model` of whatever whole model lies at a path.
 
     Raises:
@@ -96,16 +97,7 @@ def read_whole(path: str, image_size: int | None) -> PlaceModel:
     return read_model(path, kind, ModelConfig(), image_size)
 
 
-def at_size(model: PlaceModel, image_size: int) -> PlaceModel:
-    """The same weights for inputs of another side, in eval mode."""
-    bare = dataclasses.replace(model.config, backbone=dataclasses.replace(model.config.backbone, weights=None))
-    other = build_model(bare, image_size)
-    fit(other, to_published(model.state_dict()), f"the model at {image_size} px")
-    other.config = model.config
-    return other.eval()
-
-
-def around_backbone(source: str, config: ModelConfig, image_size: int | None) -> PlaceModel:
+def around_backbone(source: str, config: ModelConfig, image_size: int | str | None) -> PlaceModel:
     """The model of `config` around released backbone weights; adapters, pooling and encoder are at their start.
 
     Raises:

@@ -20,6 +20,7 @@ from torch import Tensor
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import replacing, sha256_of
 from pipeline.config import ModelConfig, from_dict, to_dict
+from pipeline.config.image_size import ImageSize, parsed
 from pipeline.model.bank import bank_beside, read_bank
 from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.foreign import check_file, message
@@ -35,7 +36,7 @@ PUBLISHED_SIZE = 224
 def from_published(
     state_dict: Mapping[str, Any],
     source: str = "the state dict",
-    image_size: int = PUBLISHED_SIZE,
+    image_size: int | str = PUBLISHED_SIZE,
     config: ModelConfig | None = None,
 ) -> PlaceModel:
     """The paper's model from a released CricaVPR state dict, in eval mode.
@@ -44,7 +45,7 @@ def from_published(
         state_dict: its 668 tensors, with or without the `module.` prefix, also inside the published trainer's
             checkpoint (`model_state_dict`). float64 tensors stay float64, all others become float32.
         source: what an error message calls it.
-        image_size: side of the input in pixels; the position embedding is resized to it.
+        image_size: of the input; the position embedding is resized to it.
         config: a model of published names and other sizes; the paper's by default.
 
     Raises:
@@ -59,7 +60,7 @@ def from_published(
     return model.eval()
 
 
-def without_weights(config: ModelConfig, image_size: int) -> PlaceModel:
+def without_weights(config: ModelConfig, image_size: int | str) -> PlaceModel:
     """The model with shapes but no memory, for tensors that are about to be assigned."""
     bare = dataclasses.replace(config, backbone=dataclasses.replace(config.backbone, weights=None))
     with torch.device("meta"):
@@ -104,7 +105,7 @@ def save_model(
     model: PlaceModel,
     path: str | Path,
     config: ModelConfig,
-    image_size: int,
+    image_size: int | str,
     everything: bool,
     extra: dict[str, Any] | None = None,
     *,
@@ -159,7 +160,7 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
     try:
         return {
             "config": from_dict(ModelConfig, json.loads(metadata["config"])),
-            "image_size": int(metadata["image_size"]),
+            "image_size": parsed(metadata["image_size"]).setting,
             "everything": json.loads(metadata["everything"]),
             "backbone_hash": metadata["backbone_hash"],
             "extra": json.loads(metadata["extra"]),
@@ -205,6 +206,24 @@ def load_model(path: str | Path, device: torch.device | str = "cpu") -> PlaceMod
         load_trainable(model, file)
     model.bank = read_bank(bank_beside(file))
     return model.to(device).eval()
+
+
+def at_size(model: PlaceModel, image_size: int | str) -> PlaceModel:
+    """The same weights and bank for inputs of another size, in eval mode; the model itself where it has that size.
+
+    Raises:
+        UsageError: a size that the model cannot have.
+    """
+    size = ImageSize.of(image_size)
+    if size.setting == model.image_size:
+        return model
+    if model.pooling.least is None:
+        kind, own = model.config.pooling.kind, ImageSize.of(model.image_size)
+        raise UsageError(f"the weights of pooling.kind {kind} are for {own.text} px alone, not for {size.text} px")
+    other = without_weights(model.config, size.setting)
+    fit(other, to_published(model.state_dict()), f"the model at {size.text} px", assign=True)
+    other.bank = model.bank
+    return other.to(next(model.parameters()).device).eval()
 
 
 def load_trainable(model: PlaceModel, path: str | Path) -> dict[str, Any]:

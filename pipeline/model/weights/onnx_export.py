@@ -35,7 +35,7 @@ TOLERANCE = 1e-4  # of the largest value; float32 with another order of sums sta
 
 
 class PerImage(nn.Module):
-    """images [b, 3, S, S], normalised -> regions [b, R, D], or descriptors [b, R*D]."""
+    """images [b, 3, H, W], normalised -> regions [b, R, D], or descriptors [b, R*D]."""
 
     def __init__(self, model: PlaceModel, output: Output) -> None:
         super().__init__()
@@ -43,7 +43,7 @@ class PerImage(nn.Module):
         self.beside = BesideBank(model, model.bank) if output == "descriptors" and model.bank is not None else None
 
     def forward(self, images: Tensor) -> Tensor:
-        """[b, 3, S, S] -> [b, R, D] or [b, R*D]."""
+        """[b, 3, H, W] -> [b, R, D] or [b, R*D]."""
         regions = self.model.encode(images)
         if self.output == "regions":
             return regions
@@ -57,16 +57,18 @@ class PerImage(nn.Module):
 def export_onnx(model: PlaceModel, path: Path, output: Output = "descriptors") -> float:
     """Writes the ONNX file (above 2 GB its tensors go beside it, in `<name>.data`); returns the largest difference.
 
-    The input is `images`, float32 [batch, 3, S, S], ImageNet-normalised; the file's metadata holds the config, the
+    The input is `images`, float32 [batch, 3, H, W], ImageNet-normalised; the file's metadata holds the config, the
     image size, mean and standard deviation.
 
     Raises:
-        UsageError: the packages of the extra `onnx` are missing.
+        UsageError: the packages of the extra `onnx` are missing, or inputs have no one size.
         DataError: onnxruntime's result is not torch's; nothing is written then.
     """
     absent = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
     if absent:
         raise UsageError(f"ONNX export needs {', '.join(absent)}: pip install 'place-recognition-training[onnx]'")
+    if model.input_size.native:
+        raise UsageError(f"{path}: an ONNX file has inputs of one size: give --image_size a side, or height x width")
     model = model.float().cpu().eval()
     folder = path.with_name(f".{path.name}.partial")
     shutil.rmtree(folder, ignore_errors=True)  # of a killed export
@@ -90,7 +92,7 @@ def _write(model: PlaceModel, file: Path, output: Output) -> None:
         bank = per_image.beside.bank
         groups = f"bank of {len(bank.regions)} images from {bank.source}, {bank.digest}"
     batch = torch.export.Dim("batch", min=1)
-    example = torch.zeros(2, 3, model.image_size, model.image_size)
+    example = torch.zeros(2, 3, *model.input_size.largest)
     with _quiet(), torch.no_grad():
         graph = torch.export.export(per_image, (example,), dynamic_shapes={"images": {0: batch}})
         program: Any = torch.onnx.export(
@@ -119,7 +121,7 @@ def check(model: PlaceModel, file: Path, output: Output) -> float:
     generator = torch.Generator().manual_seed(0)
     worst = 0.0
     for count in (1, 3):
-        images = torch.randn(count, 3, model.image_size, model.image_size, generator=generator)
+        images = torch.randn(count, 3, *model.input_size.largest, generator=generator)
         one: Any = model.encode if output == "regions" else model
         if output == "descriptors" and model.bank is not None:
             one = BesideBank(model, model.bank)

@@ -88,7 +88,7 @@ def recognise(tensors: Mapping[str, Tensor]) -> str | None:
 
 
 def from_release(
-    tensors: Mapping[str, Tensor], source: str, kind: str | None = None, image_size: int | None = None
+    tensors: Mapping[str, Tensor], source: str, kind: str | None = None, image_size: int | str | None = None
 ) -> PlaceModel:
     """Our model with a release's weights, in eval mode: its forward gives the release's descriptors.
 
@@ -96,7 +96,7 @@ def from_release(
         tensors: a state dict under the release's names.
         source: what an error message calls it, a file name.
         kind: one of `RELEASES`; none: what the names say. "gcl_avg" can only be said, its pooling leaves no trace.
-        image_size: side of the square input in pixels; none: the method's own, or its height where that is not square.
+        image_size: of the input; none: that of the method's own evaluation.
 
     Raises:
         UsageError: no such release, a variant of it that is not known here, missing, surplus or misshapen tensors.

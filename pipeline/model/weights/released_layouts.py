@@ -32,10 +32,14 @@ from pipeline.config.baselines import (
     TransVPRConfig,
     VGGConfig,
 )
+from pipeline.config.image_size import ImageSize
 from pipeline.model.backbones.resnet import BASIC, GROUPS, STAGES
 from pipeline.model.backbones.transformer import SIZES
 from pipeline.model.variants import variant
 
+# what the public code evaluates at: the benchmark's --resize, and the size in OpenIBL, Patch-NetVLAD, GCL and TransVPR;
+# CosPlace and EigenPlaces take photos as they are
+BENCHMARK, PHOTOS = "480x640", "native640"
 NEVER = r"(?!)"  # matches nothing
 COUNTERS = r"\.num_batches_tracked$"
 
@@ -89,16 +93,16 @@ class Layout:
     Attributes:
         kind: its name in `releases.RELEASES`.
         config: our model's settings.
-        image_size: side of the input where the user gives none, in pixels.
+        image_size: of the input where the user gives none: that of the method's own evaluation.
         rules: pattern of our published names -> the release's; the first that matches counts.
-        fixed: the only side the weights are for; none: any.
+        fixed: whether the weights are for this size alone.
         unused: pattern of the file's tensors that take no part in descriptors.
         optional: pattern of the file's tensors whose absence means zeros.
     """
 
     kind: str
     config: ModelConfig
-    image_size: int
+    image_size: int | str
     rules: tuple[Rule, ...]
     fixed: bool = False
     unused: str = NEVER
@@ -112,15 +116,18 @@ class Layout:
                 return name
         return own
 
-    def size(self, wanted: int | None, source: str) -> int:
-        """The side of the input in pixels.
+    def size(self, wanted: int | str | None, source: str) -> int | str:
+        """The size of the input.
 
         Raises:
             UsageError: another than the only one the weights are for.
         """
-        if self.fixed and wanted not in (None, self.image_size):
-            raise UsageError(f"{source}: its weights are for {self.image_size} px alone, not for {wanted} px")
-        return wanted or self.image_size
+        if wanted is None:
+            return self.image_size
+        size = ImageSize.of(wanted)
+        if self.fixed and size.setting != self.image_size:
+            raise UsageError(f"{source}: its weights are for {self.image_size} px alone, not for {size.text} px")
+        return size.setting
 
 
 def _model(base: str, backbone: BackboneConfig, **pooling: Any) -> ModelConfig:
@@ -204,7 +211,7 @@ def cosplace(shapes: Shapes) -> Layout:
     backbone, rules = _sequence(shapes, "backbone.")
     dim = shapes.of("aggregation.3.weight", 2)[0]
     config = _model("CosPlace", backbone, cosplace=CosPlaceConfig(dim=dim))
-    return Layout("cosplace", config, 512, (*rules, (r"^pooling\.fc\.", "aggregation.3.")))
+    return Layout("cosplace", config, PHOTOS, (*rules, (r"^pooling\.fc\.", "aggregation.3.")))
 
 
 def gem(shapes: Shapes) -> Layout:
@@ -212,7 +219,7 @@ def gem(shapes: Shapes) -> Layout:
     backbone, rules = _sequence(shapes, "backbone.")
     before = "aggregation.1.p" in shapes
     config = _model("GeM", backbone, normalise=before)
-    return Layout("gem", config, 480, (*rules, (r"^aggregation\.1\.p$", f"aggregation.{int(before)}.p")))
+    return Layout("gem", config, BENCHMARK, (*rules, (r"^aggregation\.1\.p$", f"aggregation.{int(before)}.p")))
 
 
 def gcl(shapes: Shapes, average: bool) -> Layout:
@@ -220,7 +227,7 @@ def gcl(shapes: Shapes, average: bool) -> Layout:
     backbone, rules = _sequence(shapes, "backbone.", pool_last=True)
     # the average is what residual networks and VGG have in the class token's place
     config = _model("GeM", backbone, kind="cls" if average else "gem")
-    return Layout("gcl_avg" if average else "gcl", config, 480, (*rules, (r"^aggregation\.1\.p$", "pool.p")))
+    return Layout("gcl_avg" if average else "gcl", config, BENCHMARK, (*rules, (r"^aggregation\.1\.p$", "pool.p")))
 
 
 def _vlad(shapes: Shapes, pool: str, projection: str) -> tuple[NetVLADConfig, tuple[Rule, ...]]:
@@ -236,14 +243,14 @@ def netvlad(shapes: Shapes) -> Layout:
     theirs = "pool.centroids" in shapes
     backbone, rules = _sequence(shapes, "encoder." if theirs else "backbone.")
     vlad, names = _vlad(shapes, "pool." if theirs else "aggregation.", "WPCA.0.")
-    return Layout("netvlad", _model("NetVLAD", backbone, netvlad=vlad), 480, (*rules, *names))
+    return Layout("netvlad", _model("NetVLAD", backbone, netvlad=vlad), BENCHMARK, (*rules, *names))
 
 
 def sfrs(shapes: Shapes) -> Layout:
     """SFRS: VGG-16 for RGB 0..255 less means, NetVLAD, and in the hub's file PCA with whitening as a convolution."""
     backbone, rules = _sequence(shapes, "base_model.base.", matconvnet=True)
     vlad, names = _vlad(shapes, "net_vlad.", "pca_layer.")
-    return Layout("sfrs", _model("NetVLAD", backbone, netvlad=vlad), 480, (*rules, *names))
+    return Layout("sfrs", _model("NetVLAD", backbone, netvlad=vlad), BENCHMARK, (*rules, *names))
 
 
 def mixvpr(shapes: Shapes) -> Layout:
@@ -325,7 +332,7 @@ def transvpr(shapes: Shapes) -> Layout:
     rules: tuple[Rule, ...] = (
         (r"^backbone\.", ""), (r"^pooling\.fc\.", "pool.fc.1."), (r"^pooling\.", "pool."),
     )  # fmt: skip
-    return Layout("transvpr", config, 480, rules)
+    return Layout("transvpr", config, BENCHMARK, rules)
 
 
 AGGREGATOR: Rule = (r"^pooling\.", "aggregator.")

@@ -38,7 +38,7 @@ def test_every_setting_says_what_changing_it_means_and_its_range(name: str) -> N
     assert on_resume(RunConfig)[name] == "free" or about["changes"] == "numbers", "only numbers are fixed"
     kinds = {hint_of(name), *typing.get_args(hint_of(name))}
     bounds = [about[key] for key in ("at_least", "at_most", "above", "below") if about[key] is not None]
-    if int in kinds:
+    if int in kinds and not about["image_size"]:  # its range is the type's own
         assert bounds, f"{name} states no range"
     assert flatten(built(name, flatten(RunConfig())[name])) == flatten(RunConfig())
 
@@ -58,7 +58,11 @@ def test_values_outside_a_range_are_refused_with_name_and_value(name: str) -> No
         wrong += [about["at_least"] - step] if about["at_least"] is not None else []
         wrong += [about["at_most"] + step] if about["at_most"] is not None else []
         wrong += [about[key] for key in ("above", "below") if about[key] is not None]
-    if str in kinds:
+    if about["image_size"]:
+        wrong += ["x", "224x", "224x0", "0", 0, 8193, "224x8193", "0224", " 224", "224 x 224", -1, 224.0]
+        wrong += ["native", "native640"] if about["image_size"] == "fixed" else ["native0", "native8193"]
+        right += [1, 8192, "1x8192"]
+    elif str in kinds:
         wrong += ["nul\0byte", "line\nbreak", "\x1b[31m", "x" * 300, "a/" * 3000, "\udcff", 3, False]
     for value in wrong:
         with pytest.raises(UsageError) as error:

@@ -53,13 +53,13 @@ def test_geometry_moves_by_the_published_amounts() -> None:
 
 
 def test_whole_pixel_translation_is_what_bilinear_gives(make_photo: Photo) -> None:
-    image = Image.fromarray(shrink(decode(make_photo(1)), SIZE))
+    image = Image.fromarray(shrink(decode(make_photo(1)), (SIZE, SIZE)))
     slow = image.transform(image.size, Image.Transform.AFFINE, (1, 0, -30, 0, 1, 0), Image.Resampling.BILINEAR)
     assert (apply("TranslateX", np.asarray(image)) == np.asarray(slow)).all()
 
 
 def test_colour_operations_follow_their_definitions(make_photo: Photo) -> None:
-    pixels = shrink(decode(make_photo(2)), SIZE)
+    pixels = shrink(decode(make_photo(2)), (SIZE, SIZE))
     full = pixels.astype(float)
     grey = np.asarray(Image.fromarray(pixels).convert("L")).astype(float)
     for factor, share in ((1.27, PUBLISHED), (0.73, -PUBLISHED)):
@@ -107,7 +107,7 @@ def test_pixels_depend_on_the_key_alone(make_photo: Photo, kind: augment.Augment
     pixels = decode(make_photo(7, 400, 300))
 
     def view(*key: object) -> np.ndarray:
-        return training_view(pixels, 112, kind, 3, 9, Draws(*key))
+        return training_view(pixels, (112, 112), kind, 3, 9, Draws(*key))
 
     first = view("view", 0, 0, "000001", 0)
     view("view", 5, 5, "000009", 1)  # what happened between changes nothing
@@ -115,7 +115,7 @@ def test_pixels_depend_on_the_key_alone(make_photo: Photo, kind: augment.Augment
     assert (view("view", 0, 0, "000001", 0) == first).all()
     others = [view("view", *key) for key in ((1, 0, "000001", 0), (0, 1, "000001", 0), (0, 0, "000001", 1))]
     if kind == "off":
-        assert all((other == shrink(pixels, 112)).all() for other in others)
+        assert all((other == shrink(pixels, (112, 112))).all() for other in others)
     else:
         assert all((other != first).any() for other in others)
 

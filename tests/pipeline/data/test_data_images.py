@@ -72,11 +72,11 @@ def test_training_resize_is_pillows_to_one_grey_level(make_photo: Photo, width: 
     noise = np.random.default_rng(0).integers(0, 256, pixels.shape, dtype=np.uint8)
     for source in (pixels, noise):
         expected = np.asarray(Image.fromarray(source).resize((size, size), Image.Resampling.BILINEAR)).astype(int)
-        difference = np.abs(shrink(source, size) - expected)
+        difference = np.abs(shrink(source, (size, size)) - expected)
         assert difference.max() <= 1 and difference.mean() < 0.02
         given = to_input(Image.fromarray(source), size)
         assert given.shape == (3, size, size) and given.dtype == torch.uint8 and given.is_contiguous()
-        assert (given.permute(1, 2, 0).numpy() == shrink(source, size)).all()
+        assert (given.permute(1, 2, 0).numpy() == shrink(source, (size, size))).all()
 
 
 def test_published_input_is_normalised_and_then_sampled_without_antialias(make_photo: Photo) -> None:

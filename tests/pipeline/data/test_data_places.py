@@ -272,7 +272,7 @@ def test_shards_written_by_this_project_give_back_their_photos(make_photo: Make,
             path = tmp_path / "photos" / f"place{place}" / f"{number}.jpg"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(make_photo(100 + place * 8 + number))
-            pixels = shrink(decode(path.read_bytes()), 28).transpose(2, 0, 1)
+            pixels = shrink(decode(path.read_bytes()), (28, 28)).transpose(2, 0, 1)
             source.setdefault(place, {})[pixels.tobytes()] = path.name
     write_shards(read_folders(tmp_path / "photos"), tmp_path / "set", WriteRule(rounds=2, shard_mb=0.02, workers=1))
     index = read_index(str(tmp_path / "set"))

@@ -40,7 +40,7 @@ TINY = PoolingConfig(
 def built(kind: str) -> nn.Module:
     """The aggregator with every parameter away from its start, in float64."""
     torch.manual_seed(3)
-    module = build_pooling(dataclasses.replace(TINY, kind=kind), DIM, GRID).double().eval()  # type: ignore[arg-type]
+    module = build_pooling(dataclasses.replace(TINY, kind=kind), DIM, (GRID, GRID)).double().eval()  # type: ignore[arg-type]
     with torch.no_grad():
         for name, parameter in module.named_parameters():
             if name != "p":
@@ -167,7 +167,7 @@ def test_a_dustbin_stored_as_a_number_is_read() -> None:
     module = built("salad")
     older = {n: t.squeeze() if n == "dust_bin" else t for n, t in module.state_dict().items()}
     assert older["dust_bin"].ndim == 0
-    other = build_pooling(dataclasses.replace(TINY, kind="salad"), DIM, GRID).double()
+    other = build_pooling(dataclasses.replace(TINY, kind="salad"), DIM, (GRID, GRID)).double()
     fit(other, older, "an older file")
     assert torch.equal(other.dust_bin.detach(), module.dust_bin.detach())  # type: ignore[union-attr, operator]
 
@@ -218,7 +218,7 @@ def test_published_sizes(
     kind: str, settings: dict[str, object], dim: int, grid: int, count: int | None, size: int
 ) -> None:
     config = dataclasses.replace(PoolingConfig(kind=kind), **settings)  # type: ignore[arg-type]
-    module = build_pooling(config, dim, grid)
+    module = build_pooling(config, dim, (grid, grid))
     c = config.boq.channels
     if count is None:  # the formula: 3x3 projection and norm; a layer's encoder, two attentions, queries, two norms
         layer = 12 * c * c + 13 * c + 2 * (4 * c * c + 4 * c) + 64 * c + 4 * c
@@ -311,6 +311,6 @@ def test_every_name_the_method_wants_exists() -> None:
 
 def test_salad_refuses_more_clusters_than_patches() -> None:
     with pytest.raises(UsageError, match=r"clusters 64.*49 patches"):
-        build_pooling(PoolingConfig(kind="salad"), 32, 7)
+        build_pooling(PoolingConfig(kind="salad"), 32, (7, 7))
     with pytest.raises(UsageError, match=r"boq\.channels 100"):
-        build_pooling(PoolingConfig(kind="boq", boq=BoQConfig(channels=100)), 32, 7)
+        build_pooling(PoolingConfig(kind="boq", boq=BoQConfig(channels=100)), 32, (7, 7))

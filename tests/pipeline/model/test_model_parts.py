@@ -54,7 +54,7 @@ def pooled_slowly(tokens: Tensor, kind: str, levels: tuple[int, ...], p: float) 
     ],
 )  # fmt: skip
 def test_pooling_is_its_definition(kind: str, levels: tuple[int, ...], count: int) -> None:
-    pooling = Pooling(PoolingConfig(kind=kind, levels=levels, p=2.5), 7).double()  # type: ignore[arg-type]
+    pooling = Pooling(PoolingConfig(kind=kind, levels=levels, p=2.5), (7, 7)).double()  # type: ignore[arg-type]
     tokens = torch.randn(2, 50, 8, dtype=torch.float64)
     regions = pooling(tokens)
     assert regions.shape == (2, count, 8) and pooling.regions == count
@@ -63,7 +63,7 @@ def test_pooling_is_its_definition(kind: str, levels: tuple[int, ...], count: in
 
 
 def test_pooling_stays_float32_under_autocast() -> None:
-    pooling = Pooling(PoolingConfig(), 6)
+    pooling = Pooling(PoolingConfig(), (6, 6))
     tokens = torch.randn(2, 37, 8)
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(pooling(tokens), pooling(tokens.clone()))
@@ -73,11 +73,11 @@ def test_pooling_stays_float32_under_autocast() -> None:
 
 def test_pooling_refuses_more_cells_than_tokens() -> None:
     with pytest.raises(UsageError, match="levels"):
-        Pooling(PoolingConfig(levels=(1, 9)), 8)
+        Pooling(PoolingConfig(levels=(1, 9)), (8, 8))
 
 
-def stirred(config: AdapterConfig, dim: int = 16) -> ConvAdapter:
-    adapter = build_adapter(config, dim).double()
+def stirred(config: AdapterConfig, side: int = 5, dim: int = 16) -> ConvAdapter:
+    adapter = build_adapter(config, dim, (side, side)).double()
     for name, parameter in adapter.named_parameters():
         torch.nn.init.normal_(parameter, std=0.3)
         if name.endswith("conv.bias"):  # else now and then all ReLUs of a narrow path are at zero
@@ -92,7 +92,7 @@ def stirred(config: AdapterConfig, dim: int = 16) -> ConvAdapter:
 )
 def test_adapter_kernels_and_skip(kind: str, reach: int, times: int) -> None:
     """How far one patch reaches over the others, and how often the class token enters the last Linear."""
-    adapter = stirred(AdapterConfig(kind=kind, norm="none", reduced=3))  # type: ignore[arg-type]
+    adapter = stirred(AdapterConfig(kind=kind, norm="none", reduced=3), side=9)  # type: ignore[arg-type]
     x = torch.randn(1, 1 + 81, 16, dtype=torch.float64)
     moved = x.clone()
     moved[0, 1 + 40] += 1.0  # the middle of 9 x 9
@@ -153,7 +153,7 @@ def test_adapter_initialisation() -> None:
     """Both start at a zero output; the published constant makes the reduced channels alike, Kaiming does not."""
     x = torch.randn(2, 1 + 25, 64)
     for init in ("published", "kaiming"):
-        adapter = build_adapter(AdapterConfig(init=init), 64)  # type: ignore[arg-type]
+        adapter = build_adapter(AdapterConfig(init=init), 64, (5, 5))  # type: ignore[arg-type]
         assert not adapter(x).any()
         reduction = next(p.detach() for n, p in adapter.named_parameters() if n == "paths.1.0.conv.weight")
         assert bool(torch.equal(reduction, torch.full_like(reduction, 1e-5))) == (init == "published")
@@ -164,13 +164,13 @@ def test_adapter_initialisation() -> None:
 
 def test_positions_resize_by_scale_and_pass_gradient() -> None:
     stored = torch.randn(1, 1 + 37 * 37, 4, dtype=torch.float64)
-    frozen = resize_positions(stored, 23)
-    trained = resize_positions(stored.clone().requires_grad_(), 23)
+    frozen = resize_positions(stored, (23, 23))
+    trained = resize_positions(stored.clone().requires_grad_(), (23, 23))
     assert frozen.shape == (1, 1 + 23 * 23, 4) and torch.equal(frozen[:, 0], stored[:, 0])
     assert torch.allclose(frozen, trained.detach(), atol=1e-5) and trained.requires_grad
     by_size = F.interpolate(stored[:, 1:].reshape(1, 37, 37, 4).permute(0, 3, 1, 2), size=(23, 23), mode="bicubic")
     assert (frozen[:, 1:] - by_size.permute(0, 2, 3, 1).flatten(1, 2)).abs().max() > 1e-3
-    assert resize_positions(stored, 37) is stored
+    assert resize_positions(stored, (37, 37)) is stored
 
 
 @pytest.mark.parametrize("attention", ["sdpa", "eager"])

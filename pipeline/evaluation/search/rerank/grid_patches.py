@@ -20,24 +20,26 @@ SIDE = 4  # patches: a smaller grid tells too little
 
 
 class GridPatches(Reranker):
-    """Patch tokens of a layer, matched under a similarity transform. Features: [G*G, D] in float16, of unit length.
+    """Patch tokens of a layer, matched under a similarity transform. Features: [h*w, D] in float16, of unit length, and
+    [h, w].
 
     Raises:
         UsageError: no such layer, or fewer than 4 x 4 patches; the same on all ranks.
     """
 
     def describe(self, image: Tensor) -> Features:
-        """[3, S, S] -> ([G*G, D],), of unit length but for float16's rounding."""
+        """[3, H, W] -> ([h*w, D], [h, w]); the first of unit length but for float16's rounding."""
+        backbone, layer = self.model.backbone, self.config.rerank_layer
         with torch.no_grad():
-            tokens: Tensor = self.model.backbone.patches(image[None], self.config.rerank_layer)[0]
+            tokens: Tensor = backbone.patches(image[None], layer)[0]
         if len(tokens) < SIDE * SIDE:
             raise UsageError(
                 f"rerank: an image has {len(tokens)} patches and needs at least 16; use a larger image_size"
             )
-        return (F.normalize(tokens.float(), dim=-1).half(),)
+        return F.normalize(tokens.float(), dim=-1).half(), torch.tensor(backbone.grid_of(*image.shape[1:], layer))
 
     def compare(self, query: Features, candidate: Features, seed: tuple[int, int]) -> tuple[float, ...]:
         """The number of matches in agreement."""
-        side = self.grid(len(query[0]))
+        a, b = int(query[1][1]), int(candidate[1][1])
         left, right = mutual_matches(query[0].float(), candidate[0].float())
-        return (similarity_inliers(left % side + 1j * (left // side), right % side + 1j * (right // side), seed),)
+        return (similarity_inliers(left % a + 1j * (left // a), right % b + 1j * (right // b), seed),)

@@ -32,7 +32,8 @@ def spread(values: Tensor) -> Tensor:
 class KeyPatches(Reranker):
     """The score is the number of mutual matches between key patches that agree with one homography.
 
-    Features: patches [K, D] of `rerank_layer` (block 4) under the final norm, their row numbers in the grid [K].
+    Features: patches [K, D] of `rerank_layer` (block 4) under the final norm, their row numbers [K] in the grid,
+    and [h, w].
 
     Raises:
         UsageError: another model, no such block, no OpenCV.
@@ -49,22 +50,22 @@ class KeyPatches(Reranker):
         super().__init__(model, config, device)
 
     def describe(self, image: Tensor) -> Features:
-        """[3, S, S] -> ([K, D], int64 [K])."""
+        """[3, H, W] -> ([K, D], int64 [K], [h, w])."""
+        grid = torch.tensor(self.model.backbone.grid_of(*image.shape[1:]))
         with torch.no_grad():
             every = self.model.backbone.every_block(image[None])
             maps = self.model.pooling.maps(self.model.backbone.joined(every))[0]  # [L, N]
             rows = (spread(spread(maps).sum(0)) > LEAST).nonzero().flatten()
-            return every[self.layer - 1][0, 1:][rows], rows
+            return every[self.layer - 1][0, 1:][rows], rows, grid
 
     def compare(self, query: Features, candidate: Features, seed: tuple[int, int]) -> tuple[float, ...]:
         """The number of matches in agreement."""
-        (a, a_rows), (b, b_rows) = query, candidate
+        (a, a_rows, a_grid), (b, b_rows, b_grid) = query, candidate
         if not len(a) or not len(b):
             return (0,)
         left, right = mutual_matches(a, b)
-        side = self.model.backbone.grid
         of_query, of_candidate = (
-            positions(rows.cpu().numpy()[which], side) * PATCH + PATCH // 2
-            for rows, which in ((a_rows, left), (b_rows, right))
+            positions(rows.cpu().numpy()[which], int(grid[1])) * PATCH + PATCH // 2
+            for rows, grid, which in ((a_rows, a_grid, left), (b_rows, b_grid, right))
         )
         return (homography_inliers(of_query, of_candidate, 1.5 * PATCH),)

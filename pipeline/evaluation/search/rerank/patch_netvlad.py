@@ -33,7 +33,8 @@ class PatchNetVLAD(Reranker):
     """The score of a size: the part of the patches that are mutual matches and agree with one homography.
 
     Needs a model with NetVLAD, such as Patch-NetVLAD's release, whose WPCA then shortens the patches' descriptors too.
-    Features: for each size p [(G-p+1)^2, D'], of unit length; overlapping patches are too alike for float16.
+    Features: for each size p [(h-p+1) * (w-p+1), D'], of unit length (overlapping patches are too alike for float16);
+    and [h, w].
 
     Raises:
         UsageError: no NetVLAD, too coarse a grid of tokens, a layer asked for, no OpenCV.
@@ -49,36 +50,45 @@ class PatchNetVLAD(Reranker):
             raise UsageError(f"{asked} needs a model with NetVLAD, such as its release")
         if config.rerank_layer is not None:
             raise UsageError(f"{asked} takes the patches that NetVLAD pools: leave rerank_layer out")
-        side, least = model.backbone.grid, max(SIZES)
-        if side < least:
-            raise UsageError(
-                f"{asked}: an image has {side} x {side} tokens and needs at least {least} x {least}; use a larger "
-                "image_size"
-            )
         if self.ransac:
             opencv()
         super().__init__(model, config, device)
 
     def describe(self, image: Tensor) -> Features:
-        """[3, S, S] -> for each size [P, D']."""
+        """[3, H, W] -> for each size [P, D'], and [h, w].
+
+        Raises:
+            UsageError: too few tokens for the largest size.
+        """
+        (h, w), least = self.model.backbone.grid_of(*image.shape[1:]), max(SIZES)
+        if min(h, w) < least:
+            raise UsageError(
+                f"rerank_by {self.config.rerank_by}: an image has {h} x {w} tokens and needs at least {least} x "
+                f"{least}; use a larger image_size"
+            )
         with torch.no_grad():
             tokens = self.model.backbone(image[None])
-            side = self.grid(tokens.shape[1] - 1)
-            return tuple(found[0] for found in self.model.pooling.of_patches(tokens, (side, side), SIZES))
+            found = self.model.pooling.of_patches(tokens, (h, w), SIZES)
+        return (*(each[0] for each in found), torch.tensor((h, w)))
 
     def compare(self, query: Features, candidate: Features, seed: tuple[int, int]) -> tuple[float, ...]:
         """For each size, agreement in the matches divided by the number of patches."""
         scores = []
-        for size, a, b in zip(SIZES, query, candidate, strict=True):
+        (h, w), (h2, w2) = query[-1].tolist(), candidate[-1].tolist()
+        for size, a, b in zip(SIZES, query[:-1], candidate[:-1], strict=True):
             # candidate first: RANSAC draws from the matches in their order, which is the published one
             right, left = mutual_matches(b, a)
-            side = self.grid(len(a))
-            scores.append(self.agreement(positions(left, side), positions(right, side), size, side) / len(a))
+            farthest = max(w, w2) - size, max(h, h2) - size
+            at = positions(left, w - size + 1), positions(right, w2 - size + 1)
+            scores.append(self.agreement(*at, size, farthest) / len(a))
         return tuple(scores)
 
-    def agreement(self, left: np.ndarray, right: np.ndarray, size: int, side: int) -> float:
-        """Matches [n, 2] of a query's (left) and a candidate's patches, in patches -> how far they agree."""
-        stride = self.model.image_size // self.model.backbone.grid
+    def agreement(self, left: np.ndarray, right: np.ndarray, size: int, farthest: tuple[int, int]) -> float:
+        """Matches [n, 2] of a query's (left) and a candidate's patches, in patches -> how far they agree.
+
+        `farthest`: the largest column and row of either.
+        """
+        stride = self.model.backbone.stride
         middle = size * stride // 2 - 1  # of a patch's pixels, rounded down as published
         return homography_inliers(right * stride + middle, left * stride + middle, 1.5 * stride)
 
@@ -94,6 +104,6 @@ class PatchNetVLADRapid(PatchNetVLAD):
 
     ransac = False
 
-    def agreement(self, left: np.ndarray, right: np.ndarray, size: int, side: int) -> float:
+    def agreement(self, left: np.ndarray, right: np.ndarray, size: int, farthest: tuple[int, int]) -> float:
         """As `rapid_score`."""
-        return rapid_score(right, left, (side - 1, side - 1))
+        return rapid_score(right, left, farthest)

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.common.errors import UsageError
 from pipeline.config import EvaluationConfig
+from pipeline.config.image_size import input_size
 
 Features = tuple[Tensor, ...]
-"""Of one photo, on the model's device."""
+"""Of one photo, on the model's device; what tells a shape, on the CPU."""
 
 
 class Reranker(ABC):
@@ -35,11 +35,11 @@ class Reranker(ABC):
 
     def __init__(self, model: Any, config: EvaluationConfig, device: torch.device | str) -> None:
         self.model, self.config, self.device = model, config, torch.device(device)
-        self.describe(torch.zeros(3, model.image_size, model.image_size, device=self.device))
+        self.describe(torch.zeros(3, *input_size(model).largest, device=self.device))
 
     @abstractmethod
     def describe(self, image: Tensor) -> Features:
-        """What is matched of a normalised image [3, S, S], without gradient."""
+        """What is matched of a normalised image [3, H, W], without gradient."""
 
     @abstractmethod
     def compare(self, query: Features, candidate: Features, seed: tuple[int, int]) -> tuple[float, ...]:
@@ -48,14 +48,3 @@ class Reranker(ABC):
     def combine(self, scores: np.ndarray) -> np.ndarray:
         """Scores of a query's candidates [n, columns] -> one of each [n]; the largest comes first."""
         return scores[:, 0]
-
-    def grid(self, patches: int) -> int:
-        """The side of the square grid of so many patches.
-
-        Raises:
-            UsageError: they are none: tokens of another arrangement.
-        """
-        side = round(patches**0.5)
-        if side * side != patches:
-            raise UsageError(f"rerank: {patches} patches are no square grid")
-        return side

@@ -18,6 +18,7 @@ import torch
 from pipeline import distributed
 from pipeline.common.errors import UsageError
 from pipeline.common.progress import Progress
+from pipeline.config.image_size import input_size
 from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.search.rerank.reranker import Features, Reranker
 from pipeline.evaluation.sets.evaluation_set import EvaluationSet
@@ -51,7 +52,7 @@ class Described:
         """
         if path not in self._kept:
             begun, stage = time.perf_counter(), self.reranker
-            image = to_input(load_image(path), stage.model.image_size, stage.config.resize).to(stage.device)
+            image = to_input(load_image(path), input_size(stage.model), stage.config.resize).to(stage.device)
             self._kept[path] = stage.describe(normalise(image) if image.dtype == torch.uint8 else image)
             if stage.device.type == "cuda":
                 torch.cuda.synchronize(stage.device)  # or its time would count as matching

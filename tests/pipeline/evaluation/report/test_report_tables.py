@@ -15,6 +15,7 @@ from PIL import Image
 
 from pipeline.common.errors import DataError
 from pipeline.config import EvaluationConfig
+from pipeline.config.image_size import ImageSize
 from pipeline.evaluation.evaluate import Answers, Result, score
 from pipeline.evaluation.predictions import load_predictions, save_predictions
 from pipeline.evaluation.protocol import protocols
@@ -168,12 +169,18 @@ class Corner(torch.nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.image_size, self.weight = 32, torch.nn.Parameter(torch.zeros(1))
+        self.backbone = self.Backbone()
 
-    def backbone(self, images: torch.Tensor) -> torch.Tensor:
-        tokens = torch.zeros(len(images), 17, 6)
-        tokens[:, 0] = 100  # the class token is no patch
-        tokens[:, 1 + 4] = 1
-        return tokens
+    class Backbone(torch.nn.Module):
+        def grid_of(self, height: int, width: int) -> tuple[int, int]:
+            return height // 8, width // 8
+
+        def forward(self, images: torch.Tensor) -> torch.Tensor:
+            h, w = self.grid_of(*images.shape[-2:])
+            tokens = torch.zeros(len(images), 1 + h * w, 6)
+            tokens[:, 0] = 100  # the class token is no patch
+            tokens[:, 1 + w] = 1
+            return tokens
 
 
 def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
@@ -206,7 +213,7 @@ def test_the_report_stands_alone(street: EvaluationSet, tmp_path: Path) -> None:
 
 def test_attention_lies_where_the_tokens_are_large(street: EvaluationSet, tmp_path: Path) -> None:
     maps = figures.attention_maps(Corner(), street.database[:2])
-    assert maps.shape == (2, 4, 4) and np.argwhere(maps[0]).tolist() == [[1, 0]]
+    assert np.shape(maps) == (2, 4, 4) and np.argwhere(maps[0]).tolist() == [[1, 0]]
     figures.attention_overlay(Corner(), street.database[:2], tmp_path / "attention.png", "attention")
     assert Image.open(tmp_path / "attention.png").size[0] > 300
 
@@ -230,7 +237,9 @@ def test_a_map_and_its_photo_have_one_extent(
     monkeypatch.setattr(Axes, "imshow", watched)
     photos = street.database[:2]
     figures.attention_overlay(Corner(), photos, tmp_path / "a.png", "attention")
-    attention_comparison(photos, [("one", figures.attention_maps(Corner(), photos))], 32, tmp_path / "b.png", "below")
+    attention_comparison(
+        photos, [("one", figures.attention_maps(Corner(), photos))], ImageSize.of(32), tmp_path / "b.png", "below"
+    )
     pairs = [images for images in drawn.values() if len(images) == 2]
     assert len(pairs) == 4
     for (below, photo), (above, heat) in pairs:

@@ -39,7 +39,7 @@ def test_key_patches_and_scores_are_the_restated_ones() -> None:
         described = [stage.describe(image) for image in images]
         patches = every[(layer or 4) - 1][:, 1:]
         scores = []
-        for (ours, rows), theirs, mask in zip(described, patches, masks, strict=True):
+        for (ours, rows, _), theirs, mask in zip(described, patches, masks, strict=True):
             assert rows.tolist() == (mask > 0.02).nonzero().flatten().tolist() and 20 < len(rows) < 100
             torch.testing.assert_close(ours, theirs[rows], rtol=1e-4, atol=1e-5)
         for i in range(1, len(images)):
@@ -84,6 +84,6 @@ def test_what_cannot_be_matched_is_refused_before_anything_is_described(
 def test_a_blank_photo_matches_nothing() -> None:
     stage = build_reranker(transvpr(), CONFIG, "cpu")
     photo = stage.describe(views(0, 1, 6)[0])
-    nothing = (photo[0][:0], photo[1][:0])
+    nothing = (photo[0][:0], photo[1][:0], photo[2])
     assert stage.compare(photo, nothing, (0, 0)) == stage.compare(nothing, photo, (0, 0)) == (0,)
     assert stage.compare(photo, photo, (0, 0))[0] >= 4

@@ -57,6 +57,9 @@ class Colours(torch.nn.Module):
     class Backbone(torch.nn.Module):
         patch = 8
 
+        def grid_of(self, height: int, width: int, layer: int | None = None) -> tuple[int, int]:
+            return height // self.patch, width // self.patch
+
         def patches(self, images: torch.Tensor, layer: int | None = None) -> torch.Tensor:
             return torch.nn.functional.avg_pool2d(images, self.patch).flatten(2).transpose(1, 2)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,7 @@ def test_forward_is_the_published_one(layout: str, cut: str) -> None:
     with torch.no_grad():
         wanted = forward(model.backbone.state_dict(), images, layout == "keras", stages)
         tokens = model.backbone(images)
-    assert tokens.shape == (2, 1 + model.backbone.grid**2, 4 * 4 * 2 ** (len(stages) - 1))
+    assert tokens.shape == (2, 1 + math.prod(model.backbone.grid), 4 * 4 * 2 ** (len(stages) - 1))
     assert torch.allclose(tokens[:, 1:], wanted.flatten(2).transpose(1, 2), atol=1e-4, rtol=1e-4)
     assert torch.allclose(tokens[:, 0], wanted.mean((2, 3)), atol=1e-4, rtol=1e-4)
 

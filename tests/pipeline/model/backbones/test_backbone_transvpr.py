@@ -26,7 +26,7 @@ def test_published_size() -> None:
     tokenizers = sum(64 * width * side**2 + 64 for width, side in zip(widths[1:], (8, 4, 2, 1), strict=True))
     block = 3 * 256**2 + 256**2 + 256 + 2 * 512 + 2 * 256 * 512 + 256 + 512
     assert parameter_counts(model)["backbone"] == stem + tokenizers + 256 + 6 * block + 512
-    assert (model.descriptor_dim, model.regions, model.backbone.grid) == (256, 1, 30)
+    assert (model.descriptor_dim, model.regions, model.backbone.grid) == (256, 1, (30, 30))
 
 
 def test_chunks_give_the_same_gradients() -> None:
@@ -84,7 +84,7 @@ def test_settings_that_do_not_fit_are_one_line() -> None:
     pooling = dataclasses.replace(config.pooling, transvpr=AttentionMapsConfig(levels=7))
     weights = dataclasses.replace(config.backbone, weights="x.pth")
     for changed, size, message in (
-        (config, 40, "40 is not a multiple of the backbone's patch 16"),
+        (config, 40, "40 is not a multiple of the patch 16"),
         (transvpr_config(heads=3), 32, "dim 32 must be a multiple of 4 x heads 3"),
         (transvpr_config(depth=5), 32, "within the 5 blocks"),
         (dataclasses.replace(config, pooling=pooling), 32, "levels 7: tokens of 96 channels"),

@@ -88,7 +88,7 @@ def test_another_input_size_keeps_the_weights(small: ModelConfig, tmp_path: Path
     model = away_from_start(small)
     convert.write_model(model, tmp_path / "m.safetensors", "here")
     larger = convert.read_model(str(tmp_path / "m.safetensors"), "model", small, 56)
-    assert larger.image_size == 56 and larger.backbone.grid == 8  # type: ignore[union-attr]
+    assert larger.image_size == 56 and larger.backbone.grid == (8, 8)  # type: ignore[union-attr]
     assert all(torch.equal(t, larger.state_dict()[n]) for n, t in model.state_dict().items())
 
 

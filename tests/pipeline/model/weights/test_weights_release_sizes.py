@@ -63,7 +63,7 @@ def test_backbones_have_the_published_parameters(name: str, count: int) -> None:
 FULL = {  # the released sizes: what is recognised, side of the input, dimensions, parameters
     "CosPlace ResNet-50, 2048": (
         resnet_shapes(sequence("backbone."), BLOCKS["resnet50"]) | GEM | linear_shapes("aggregation.3", 2048, 2048),
-        ("cosplace", "resnet50", 512, 2048, 23_508_032 + 1 + 2048 * 2049),
+        ("cosplace", "resnet50", "native640", 2048, 23_508_032 + 1 + 2048 * 2049),
     ),
     "MixVPR": (
         resnet_shapes(MIXVPR, (3, 4, 6)) | mixvpr_shapes(400, 1024, 1024, 4, 4, bias=True),
@@ -83,11 +83,11 @@ FULL = {  # the released sizes: what is recognised, side of the input, dimension
     ),
     "SFRS": (
         vgg_shapes("base_model.base.") | vlad_shapes("net_vlad.", 64, 512) | pca("pca_layer", 4096, 32768),
-        ("sfrs", "vgg16", 480, 4096, 14_714_688 + 2 * 32768 + 4096 * 32769),
+        ("sfrs", "vgg16", "480x640", 4096, 14_714_688 + 2 * 32768 + 4096 * 32769),
     ),
     "GCL ResNeXt": (
         resnet_shapes(sequence("backbone."), (3, 4, 23, 3), groups=32) | {"pool.p": (1,)},
-        ("gcl", "resnext101_32x8d", 480, 2048, 86_742_336 + 1),
+        ("gcl", "resnext101_32x8d", "480x640", 2048, 86_742_336 + 1),
     ),
 }  # fmt: skip
 
