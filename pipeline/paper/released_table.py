@@ -22,6 +22,7 @@ from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import write_atomically
 from pipeline.common.text import Table, csv_text, markdown_text, printable
 from pipeline.config import EvaluationConfig, ModelConfig, flatten
+from pipeline.config.image_size import ImageSize
 from pipeline.config.setting import changing
 from pipeline.evaluation.identity import files_digest
 from pipeline.evaluation.protocol import protocols
@@ -94,7 +95,7 @@ class Release:
     path: Path
     method: str
     dim: int
-    image_size: int
+    image_size: int | str
 
     @property
     def data(self) -> str:
@@ -404,7 +405,7 @@ def costs(table: ReleasedTable, images_per_second: float | None = None) -> str:
         told = f", {matched:,} pairs to match" if matched else ""
         out.append(
             f"  {release.method} on {loaded.name}  [{'done' if done else 'to do'}]  {images:,} images of "
-            f"{release.image_size} px{told}; {release.path.name}, {_protocol(table, cell)}"
+            f"{ImageSize.of(release.image_size).text} px{told}; {release.path.name}, {_protocol(table, cell)}"
         )
     out += [f"  {heading(table, set_name)}" for set_name in table.sets]
     out += ["", f"still to describe: {described:,} images; still to match: {pairs:,} pairs"]

@@ -31,7 +31,8 @@ def test_a_release_is_told_imported_and_evaluated(
     source, target = tmp_path / "cosplace.pth", tmp_path / "out" / "ours.safetensors"
     torch.save({f"module.{n}": t for n, t in COSPLACE.items()}, source)
     start(weights, monkeypatch, "--source", source)
-    assert "a released CosPlace or EigenPlaces\n  photos' own shape, at most 640 px -> 16 numbers" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "a released CosPlace or EigenPlaces\n  photos' own shape, at most 640 px -> 16 numbers" in told
     start(weights, monkeypatch, "--source", source, "--to", target, "--image-size", "64")
     images = torch.randn(2, 3, 64, 64)
     with torch.no_grad():

@@ -43,7 +43,7 @@ OTHER: dict[str, Any] = {
     "groups": "shuffled", "group_size": 8, "group_seed": 1, "pca": 64, "whiten": True, "pca_source": "pitts30k",
     "resize": "published", "image_size": 322, "rule": "10 m", "without_positives": "drop", "precision": "bf16",
     "stored": "fp16", "search": "hnsw", "rerank": 5, "rerank_by": "patch-netvlad",
-    "rerank_layer": 2, "bank_from": "map",
+    "rerank_layer": 2, "bank_from": "map", "prefix": 512, "refine": 50,
 }  # fmt: skip
 
 
