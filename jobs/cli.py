@@ -185,7 +185,7 @@ def help_text(program: str, description: str, known: Sequence[Option], config_fi
 def program_name() -> str:
     """`jobs.train` under `python -m`, `vpr-train` as a console command."""
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
-    return spec.name if spec is not None else Path(sys.argv[0]).name
+    return spec.name.removesuffix(".__main__") if spec is not None else Path(sys.argv[0]).name
 
 
 def _command(program: str) -> str:

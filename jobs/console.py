@@ -14,7 +14,8 @@ from typing import NoReturn
 from jobs.cli import run_job
 
 JOBS = sorted(
-    {path.stem for path in Path(__file__).parent.glob("*.py")} - {"__init__", "cli", "console", "processes", "there"}
+    {path.stem for path in Path(__file__).parent.glob("*.py")}
+    - {"__init__", "__main__", "cli", "console", "processes", "there"}
 )
 
 

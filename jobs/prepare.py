@@ -2,6 +2,7 @@
 
     python -m jobs.prepare --source DIR --out DIR --rounds 4
     python -m jobs.prepare --verify DIR
+    python -m jobs.prepare --source DIR --out DIR --part 3 --parts 8
 
 The same command continues a killed run; after a finished run it says that nothing is to do. Exit codes: 0 done,
 2 usage, 3 too many bad images or a damaged set.
@@ -47,6 +48,11 @@ class PrepareConfig:
     """utm, msls: width of a place's sector of headings in degrees; 30 (utm) or 60 (msls) where not given; 0: all."""
     workers: int = 0
     """Processes; 0: one per core, if there is work for it. The shards' bytes do not depend on it."""
+    part: int = 0
+    """Write only this of the `parts` shares of the shards, from 1; parts may be written at the same time on several
+    machines. When all are done, the same command without part and parts adds the index."""
+    parts: int = 0
+    """Number of shares."""
     overwrite: bool = False
     """Delete the shard set in --out first."""
     verify: str | None = None
@@ -81,8 +87,13 @@ def prepare(config: PrepareConfig, source: Path, out: Path) -> None:
     """Reads the source, writes the shard set, prints the summary."""
     from shards.images import ImageRule
     from shards.sources.registry import SourceRule, read_source, reading_settings
-    from shards.writer import WriteRule, check_writable, remove_shards, write_shards
+    from shards.writer import WriteRule, check_writable, remove_shards, write_part, write_shards
 
+    if config.part or config.parts:
+        if config.overwrite:
+            raise UsageError("--overwrite deletes what other parts have written; start it once, without --part")
+        if not config.part or not config.parts:
+            raise UsageError("--part and --parts go together, as --part 3 --parts 8")
     check_writable(out)
     reading = SourceRule(config.kind, tuple(config.cities), config.cell_m, config.heading_deg)
     catalogue = read_source(source, reading)
@@ -95,6 +106,10 @@ def prepare(config: PrepareConfig, source: Path, out: Path) -> None:
         config.rounds, config.seed, config.shard_mb, image, reading_settings(catalogue.kind, reading),
         config.max_bad, config.workers,
     )  # fmt: skip
+    if config.part:
+        done = write_part(catalogue, out, rule, config.part, config.parts)
+        print(f"{out}: part {config.part} of {config.parts} is written, {done:,} groups of shards")
+        return
     summary = write_shards(catalogue, out, rule)
     print(f"{out}: {'complete' if summary.seconds else 'nothing to do, complete already'} ({catalogue.kind})")
     print(summary)

@@ -74,6 +74,10 @@ def spread(job: Processes, module: str, known: Callable[[], int | None] = lambda
         module,
         *sys.argv[1:],
     ]
+    import torch
+
+    if not torch.cuda.is_available():
+        os.environ.setdefault("DS_ACCELERATOR", "cpu")  # DeepSpeed, where it is launched, need not look and warn
     arguments = launch_command_parser().parse_args(words)
     arguments.signals_to_handle = "SIGTERM,SIGINT,SIGHUP,SIGQUIT,SIGUSR1"  # handed on to the ranks, which save
     try:

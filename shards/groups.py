@@ -23,7 +23,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from pipeline.common.errors import DataError
-from pipeline.common.files import sync_path, write_atomically
+from pipeline.common.files import locked, sync_path, write_atomically
 from pipeline.common.pictures import read_file
 from shards import schema
 from shards.catalogue import Catalogue, LeftOut, runs
@@ -74,11 +74,14 @@ class GroupPlan:
         """Photos that will be opened."""
         return int(self.counts[self.order].sum())
 
-    def tasks(self, out: Path, seed: int, rounds: int, rule: ImageRule) -> Iterator[GroupTask]:
-        """The groups' tasks in order."""
+    def tasks(
+        self, out: Path, seed: int, rounds: int, rule: ImageRule, part: int = 1, parts: int = 1
+    ) -> Iterator[GroupTask]:
+        """The groups' tasks in order; of `parts` equal shares the `part`-th, counted from 1."""
         stride = len(self.order)
         width = max(6, len(str(stride * rounds - 1)))
-        for g, (first, last) in enumerate(zip(self.bounds, self.bounds[1:], strict=False)):
+        for g in range(part - 1, len(self), parts):
+            first, last = self.bounds[g], self.bounds[g + 1]
             places = self.order[first:last]
             rows = np.concatenate([np.arange(self.starts[p], self.starts[p] + self.counts[p]) for p in places])
             yield GroupTask(
@@ -123,10 +126,19 @@ def part_path(out: Path, group: int) -> Path:
 
 
 def write_group(task: GroupTask) -> int:
-    """Writes a group's shards and its part file, unless they are there and whole; returns the photos it stands for."""
+    """Writes a group's shards and its part file, unless they are there and whole; returns the photos it stands for.
+
+    Raises:
+        UsageError: another process writes this group.
+    """
+    folder = task.out / schema.UNFINISHED
+    with locked(folder / f"group-{task.number:05d}.lock", f"--out {task.out}: another run is writing there"):
+        return _write_group(task, folder)
+
+
+def _write_group(task: GroupTask, folder: Path) -> int:
     if not _is_finished(task):
         with contextlib.ExitStack() as stack:
-            folder = task.out / schema.UNFINISHED
             names = [shard_name(r, task.number) for r in range(task.rounds)]
             shards = [stack.enter_context(ShardFile(folder / (name + ".tmp"))) for name in names]
             rows, facts = _write_samples(task, shards)

@@ -13,6 +13,7 @@ import multiprocessing
 import os
 import re
 import shutil
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -82,13 +83,48 @@ def write_shards(catalogue: Catalogue, out: Path, rule: WriteRule | None = None)
         raise DataError(f"{readable(out)}: {reason}; finished shards are kept, the same command continues") from error
 
 
+def write_part(catalogue: Catalogue, out: Path, rule: WriteRule, part: int, parts: int) -> int:
+    """Writes the `part`-th (from 1) of `parts` shares of the groups; how many they are, 0 for a finished set.
+
+    Other parts may be written at the same time, also on other machines that share `out`. Once all are written,
+    `write_shards` finds their shards there and adds the index.
+
+    Raises:
+        As `write_shards`; UsageError also for a part that is none of `parts`.
+    """
+    if not 1 <= part <= parts:
+        raise UsageError(f"--part {part}: give 1 to {parts}, the number in --parts")
+    try:
+        rule = _completed(rule, catalogue)
+        settings = rule.settings(catalogue)
+        if _already(out, settings) is not None:
+            return 0
+        plan = _planned(catalogue, out, rule)
+        _begin(out, settings)
+        _write_all(plan, out, rule, part, parts)
+        return len(range(part - 1, len(plan), parts))
+    except OSError as error:
+        raise UsageError(f"{readable(out)}: {error}; finished shards are kept, the same command continues") from error
+
+
 def _write(catalogue: Catalogue, out: Path, rule: WriteRule) -> report.Summary:
     settings = rule.settings(catalogue)
     if (done := _already(out, settings)) is not None:
         return done
     start = time.monotonic()
-    missing = len(catalogue.left_out)
-    if missing > rule.max_bad * catalogue.images:  # known before any work
+    plan = _planned(catalogue, out, rule)
+    # a second run is refused at once; one that writes a part, at the first group that both want
+    with locked(out / schema.UNFINISHED / "lock", f"--out {out}: another run is writing there"):
+        _begin(out, settings)
+        _write_all(plan, out, rule, 1, 1)
+        counts, left_out = _complete(catalogue, plan, out, rule, settings)
+    shutil.rmtree(out / schema.UNFINISHED)
+    return report.Summary(str(out), counts, report.reasons(left_out), time.monotonic() - start, plan.images)
+
+
+def _planned(catalogue: Catalogue, out: Path, rule: WriteRule) -> groups.GroupPlan:
+    """The groups to write; refuses what can be refused before any work. Makes `out`."""
+    if len(catalogue.left_out) > rule.max_bad * catalogue.images:
         _refuse(out, catalogue, list(catalogue.left_out), rule.max_bad, began=False)
     plan = groups.plan_groups(catalogue, rule.seed, rule.shard_mb)
     if not len(plan):
@@ -97,13 +133,16 @@ def _write(catalogue: Catalogue, out: Path, rule: WriteRule) -> report.Summary:
         )
     out.mkdir(parents=True, exist_ok=True)
     _check_space(out, plan, rule)
-    with _begun(out, settings):
-        with Progress("writing shards", plan.images, "images") as progress:
-            for images in _write_groups(plan, out, rule):
-                progress.advance(images)
-        counts, left_out = _complete(catalogue, plan, out, rule, settings)
-    shutil.rmtree(out / schema.UNFINISHED)
-    return report.Summary(str(out), counts, report.reasons(left_out), time.monotonic() - start, plan.images)
+    return plan
+
+
+def _write_all(plan: groups.GroupPlan, out: Path, rule: WriteRule, part: int, parts: int) -> None:
+    """The groups of a part, with a progress line."""
+    images = plan.images if parts == 1 else None  # a part's are known when its tasks are made
+    label = "writing shards" if parts == 1 else f"writing shards, part {part} of {parts}"
+    with Progress(label, images, "images") as progress:
+        for written in _write_groups(plan, out, rule, part, parts):
+            progress.advance(written)
 
 
 def check_writable(out: Path) -> None:
@@ -222,23 +261,19 @@ def _check_space(out: Path, plan: groups.GroupPlan, rule: WriteRule) -> None:
         raise UsageError(f"--out {out}: about {needed / 1e9:,.1f} GB needed, {free / 1e9:,.1f} GB free; lower --rounds")
 
 
-@contextlib.contextmanager
-def _begun(out: Path, settings: dict[str, Any]) -> Iterator[None]:
-    """The folder of unfinished work: locked against a second run, its settings written, old temporary files gone."""
+def _begin(out: Path, settings: dict[str, Any]) -> None:
+    """The folder of unfinished work, and in it the settings; parts may begin at the same moment."""
     folder = out / schema.UNFINISHED
     folder.mkdir(exist_ok=True)
-    with locked(folder / "lock", f"--out {out}: another run is writing there"):
-        for stale in folder.glob("*.tmp"):
-            stale.unlink(missing_ok=True)
-        if not (folder / SETTINGS).exists():
-            write_atomically(folder / SETTINGS, schema.canonical(settings))
-        yield
+    if not (folder / SETTINGS).exists():
+        own = folder / f"{SETTINGS}.{socket.gethostname()}.{os.getpid()}"
+        write_atomically(folder / SETTINGS, schema.canonical(settings), own)
 
 
-def _write_groups(plan: groups.GroupPlan, out: Path, rule: WriteRule) -> Iterator[int]:
-    """Writes all groups, in processes; yields the photos of each as it is finished."""
-    tasks = plan.tasks(out, rule.seed, rule.rounds, rule.image)
-    worth = 1 + plan.source_bytes // _BYTES_A_WORKER
+def _write_groups(plan: groups.GroupPlan, out: Path, rule: WriteRule, part: int, parts: int) -> Iterator[int]:
+    """Writes the groups of a part, in processes; yields the photos of each as it is finished."""
+    tasks = plan.tasks(out, rule.seed, rule.rounds, rule.image, part, parts)
+    worth = 1 + plan.source_bytes // parts // _BYTES_A_WORKER
     workers = min(rule.workers or min(len(os.sched_getaffinity(0)), worth), len(plan))
     if workers == 1:
         yield from map(groups.write_group, tasks)

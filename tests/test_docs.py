@@ -46,6 +46,8 @@ ELSEWHERE = {
     "python -m jobs.locate --checkpoint outputs/cricavpr --index outputs/my_index --serve":
         "tests/jobs/test_job_locate.py",
     "python -m pytest tests/gpu": "it needs a GPU",
+    "docker": "it needs Docker; tests/jobs/test_container.py runs the entry point",
+    "mlflow artifacts download": "tests/pipeline/training/records/test_records_tracking.py",
 }  # fmt: skip
 # a page's commands of a job that tests/jobs/test_job_weights_figures.py reads from the page and runs
 PAGES_ELSEWHERE = [

@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 JOBS = sorted(
     path.stem
     for path in (ROOT / "jobs").glob("*.py")
-    if path.stem not in ("__init__", "cli", "console", "processes", "there")
+    if path.stem not in ("__init__", "__main__", "cli", "console", "processes", "there")
 )
 
 

@@ -187,3 +187,38 @@ def test_real_photos(shared_dir: Path, tmp_path: Path) -> None:
     row = opened.table.to_pylist()[5]
     data = (out / row["shard"]).read_bytes()
     assert simplejpeg.decode_jpeg(data[row["offsets"][2] :][: row["sizes"][2]]).shape == (128, 228, 3)
+
+
+def test_parts_written_at_the_same_time_make_the_same_set(
+    source: Path, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    """Three parts at once, one of them killed and started again; then the index: the bytes of one whole run."""
+    words = ["--source", source, "--out", tmp_path / "out", "--rounds", 2, "--shard-mb", 0.06, "--workers", 1]
+    parts = [[*words, "--part", part, "--parts", 3] for part in (1, 2, 3)]
+    running = [subprocess.Popen(command(part), cwd=ROOT, stdout=subprocess.PIPE, text=True) for part in parts]
+    until = time.monotonic() + 60
+    while not list(tmp_path.glob("out/unfinished/part-*")) and time.monotonic() < until:
+        time.sleep(0.002)
+    running[0].kill()
+    said = [process.communicate(timeout=60)[0] for process in running]
+    assert [process.returncode for process in running[1:]] == [0, 0]
+    assert "part 2 of 3 is written" in said[1]
+    assert job(*parts[0]).returncode == 0
+    assert not (tmp_path / "out" / "manifest.json").exists()
+    done = job(*words)
+    assert done.returncode == 0 and contents(tmp_path / "out") == whole, done.stderr
+    again = job(*parts[1])
+    assert again.returncode == 0 and contents(tmp_path / "out") == whole, "a finished set stays as it is"
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        (["--part", "4", "--parts", "3"], "--part 4: give 1 to 3"),
+        (["--part", "1"], "--part and --parts go together"),
+        (["--part", "1", "--parts", "3", "--overwrite"], "--overwrite deletes"),
+    ],
+)
+def test_parts_that_cannot_be_are_refused(source: Path, tmp_path: Path, words: list[str], wanted: str) -> None:
+    refused = job("--source", source, "--out", tmp_path / "out", *words)
+    assert refused.returncode == 2 and wanted in refused.stderr
