@@ -76,11 +76,8 @@ def write_shards(catalogue: Catalogue, out: Path, rule: WriteRule | None = None)
         DataError: a full disk; more than `max_bad` of the images are missing or broken (all named in report.csv); no
             place has four images.
     """
-    try:
+    with _told(out):
         return _write(catalogue, out, _completed(rule or WriteRule(), catalogue))
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise DataError(f"{readable(out)}: {reason}; finished shards are kept, the same command continues") from error
 
 
 def write_part(catalogue: Catalogue, out: Path, rule: WriteRule, part: int, parts: int) -> int:
@@ -94,7 +91,7 @@ def write_part(catalogue: Catalogue, out: Path, rule: WriteRule, part: int, part
     """
     if not 1 <= part <= parts:
         raise UsageError(f"--part {part}: give 1 to {parts}, the number in --parts")
-    try:
+    with _told(out):
         rule = _completed(rule, catalogue)
         settings = rule.settings(catalogue)
         if _already(out, settings) is not None:
@@ -103,8 +100,16 @@ def write_part(catalogue: Catalogue, out: Path, rule: WriteRule, part: int, part
         _begin(out, settings)
         _write_all(plan, out, rule, part, parts)
         return len(range(part - 1, len(plan), parts))
+
+
+@contextlib.contextmanager
+def _told(out: Path) -> Iterator[None]:
+    """A disk's error in one line."""
+    try:
+        yield
     except OSError as error:
-        raise UsageError(f"{readable(out)}: {error}; finished shards are kept, the same command continues") from error
+        reason = error.strerror or str(error)
+        raise DataError(f"{readable(out)}: {reason}; finished shards are kept, the same command continues") from error
 
 
 def _write(catalogue: Catalogue, out: Path, rule: WriteRule) -> report.Summary:
