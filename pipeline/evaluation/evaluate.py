@@ -32,6 +32,7 @@ from pipeline.evaluation.recall import recall_at
 from pipeline.evaluation.search.approximate import agreement, build_index, bytes_each, index_bytes, search_index
 from pipeline.evaluation.search.cores import all_cores
 from pipeline.evaluation.search.exact import Blocks, batches, search, search_within
+from pipeline.evaluation.search.on_device import search_on_devices
 from pipeline.evaluation.search.projection import (
     Prefix,
     Projection,
@@ -142,7 +143,8 @@ def evaluate(
             for protocol in chosen:
                 described = {side: sides[side].describe(protocol) for side in SIDES}
                 fitted = (projections or {}).get(protocol.grouping.name)
-                answer = on_rank_0(partial(answer_queries, evaluated, protocol, config, described, fitted))
+                answer_by = answer_on_devices if on_devices(device, evaluated, protocol) else _answer_on_rank_0
+                answer = answer_by(evaluated, protocol, config, described, fitted, device)
                 if second is not None:
                     rows, distances, cost = rerank(second, evaluated, answer.rows, answer.distances, progress)
                     remarks = (*answer.remarks, f"{protocol.name}: {cost}")
@@ -257,13 +259,7 @@ def answer_queries(
 
     PCA is fitted on the set's own database where the protocol asks for PCA and none is given.
     """
-    database, queries = _there(described["database"]), _there(described["queries"])
-    if protocol.pca:
-        short: Projection | Prefix = fitted or own_projection(evaluated, protocol, database)
-    elif protocol.prefix:
-        short = Prefix(protocol.prefix)
-    if protocol.pca or protocol.prefix:
-        database, queries = projected(database, short), projected(queries, short)
+    database, queries = _shortened(evaluated, protocol, described, fitted)
     k = max(*config.recalls, protocol.rerank)
     found = np.full((len(evaluated.queries), k), -1, np.int64)
     distances = np.full((len(evaluated.queries), k), np.inf, np.float32)
@@ -295,6 +291,67 @@ def answer_queries(
     remark = f"{protocol.name} finds {share:.1f} % of the exact {k} neighbours ({len(sample):,} queries), index"
     cost = SearchCost(*bytes_each(index), 1e3 * clock.seconds / len(found))
     return Answers(found, distances, (f"{remark} {index_bytes(index) / 1e6:,.1f} MB",), cost)
+
+
+def on_devices(device: torch.device, evaluated: EvaluationSet, protocol: Protocol) -> bool:
+    """Whether the ranks' GPUs search: exactly, and in the whole database. faiss does everything else."""
+    return device.type == "cuda" and protocol.search == "exact" and evaluated.database_part is None
+
+
+def answer_on_devices(
+    evaluated: EvaluationSet,
+    protocol: Protocol,
+    config: EvaluationConfig,
+    described: Mapping[Side, Blocks | None],
+    fitted: Projection | None,
+    device: torch.device,
+) -> Answers:
+    """As `answer_queries`, by all ranks, each on its `device`; the same on all. Collective."""
+    sides: list[Blocks] = []
+    on_rank_0(lambda: sides.extend(_shortened(evaluated, protocol, described, fitted)))
+    coming = batches(sides[1]) if sides else iter(())
+    k = max(*config.recalls, protocol.rerank)
+    found = np.full((len(evaluated.queries), k), -1, np.int64)
+    distances = np.full((len(evaluated.queries), k), np.inf, np.float32)
+    taken: list[np.ndarray] = []
+
+    def take() -> np.ndarray | None:
+        batch = next(coming, None)
+        taken[:] = () if batch is None else (batch[1],)
+        return None if batch is None else batch[0]
+
+    while (numbers := on_rank_0(take)) is not None:
+        asked, database = (taken[0], sides[0]) if sides else (None, None)
+        distances[numbers], found[numbers] = search_on_devices(asked, database, k, device)
+    return Answers(found, distances)
+
+
+def _answer_on_rank_0(
+    evaluated: EvaluationSet,
+    protocol: Protocol,
+    config: EvaluationConfig,
+    described: Mapping[Side, Blocks | None],
+    fitted: Projection | None,
+    device: torch.device,
+) -> Answers:
+    return on_rank_0(partial(answer_queries, evaluated, protocol, config, described, fitted))
+
+
+def _shortened(
+    evaluated: EvaluationSet,
+    protocol: Protocol,
+    described: Mapping[Side, Blocks | None],
+    fitted: Projection | None,
+) -> tuple[Blocks, Blocks]:
+    """Database and queries as the protocol compares them: whole, projected, or cut."""
+    database, queries = _there(described["database"]), _there(described["queries"])
+    if protocol.pca:
+        short: Projection | Prefix = fitted or own_projection(evaluated, protocol, database)
+    elif protocol.prefix:
+        short = Prefix(protocol.prefix)
+    else:
+        return database, queries
+    return projected(database, short), projected(queries, short)
 
 
 def own_projection(evaluated: EvaluationSet, protocol: Protocol, database: Blocks) -> Projection:

@@ -62,9 +62,9 @@ def search(
     """
     best = np.full((len(queries), k), np.inf, np.float32)
     rows = np.full((len(queries), k), -1, np.int64)
-    _finite(queries, "query")
+    check_finite(queries, "query")
     for numbers, block in database:
-        _finite(block, "database")
+        check_finite(block, "database")
         for first in range(0, len(queries), QUERIES):
             part = slice(first, first + QUERIES)
             distances, found = _nearest(float32(queries[part]), float32(block), min(k, len(block)), gpu)
@@ -106,7 +106,8 @@ def float32(array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
-def _finite(array: np.ndarray, side: str) -> None:
+def check_finite(array: np.ndarray, side: str) -> None:
+    """Raises `DataError` for descriptors that are not finite; `side`: query or database."""
     for first in range(0, len(array), ROWS):
         bad = ~np.isfinite(array[first : first + ROWS].astype(np.float32, copy=False).sum(axis=1))
         if bad.any():

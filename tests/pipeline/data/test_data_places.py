@@ -272,14 +272,13 @@ def test_shards_written_by_this_project_give_back_their_photos(make_photo: Make,
             path = tmp_path / "photos" / f"place{place}" / f"{number}.jpg"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(make_photo(100 + place * 8 + number))
-            pixels = shrink(decode(path.read_bytes()), (28, 35)).transpose(2, 0, 1)
+            pixels = shrink(decode(path.read_bytes()), (28, 28)).transpose(2, 0, 1)
             source.setdefault(place, {})[pixels.tobytes()] = path.name
     write_shards(read_folders(tmp_path / "photos"), tmp_path / "set", WriteRule(rounds=2, shard_mb=0.02, workers=1))
     index = read_index(str(tmp_path / "set"))
     shown: dict[int, set[str]] = {place: set() for place in range(9)}
-    config = dataclasses.replace(CONFIG, augment="off", places_per_batch=3, image_size="28x35")
     for number in (0, 1):
-        for _, labels, images in epoch(index, config, number):
+        for _, labels, images in epoch(index, dataclasses.replace(CONFIG, augment="off", places_per_batch=3), number):
             for label, image in zip(labels.tolist(), images, strict=True):
                 shown[label].add(source[label][image.numpy().tobytes()])
     assert all(len(names) == 8 for names in shown.values())  # two rounds of four show all eight photos of each place
