@@ -72,6 +72,54 @@ class _Gather(torch.autograd.Function):
         return own
 
 
+class _Started:
+    """A gather on its way, forward or backward, and the tensors that it works on."""
+
+    work: Any
+    tensors: tuple[Tensor, ...] = ()
+
+    def wait(self) -> None:
+        self.work.wait()
+        self.tensors = ()
+
+
+class _Begin(torch.autograd.Function):
+    """Starts the exchange forward; backward waits for the one that `_End` started."""
+
+    @staticmethod
+    def forward(ctx: Any, local: Tensor, exchange: _Started) -> Tensor:
+        ctx.exchange = exchange
+        local = local.contiguous()
+        gathered = local.new_empty((dist.get_world_size() * local.shape[0], *local.shape[1:]))
+        exchange.tensors = (gathered, local)
+        exchange.work = _all_gather(gathered, local, async_op=True)
+        return local.view_as(local)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        ctx.exchange.wait()
+        return grads[0], None
+
+
+class _End(torch.autograd.Function):
+    """Waits for what `_Begin` started; backward starts the exchange of the gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, begun: Tensor, exchange: _Started) -> Tensor:
+        ctx.exchange = exchange
+        gathered = exchange.tensors[0]
+        exchange.wait()
+        return gathered
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:  # [B, ...] -> [b, ...], complete in _Begin.backward
+        grad = grads[0].contiguous()
+        own = grad.new_empty((grad.shape[0] // dist.get_world_size(), *grad.shape[1:]))
+        ctx.exchange.tensors = (own, grad)
+        ctx.exchange.work = _reduce_scatter(own, grad, op=dist.ReduceOp.SUM, async_op=True)
+        return own, None
+
+
 class _Sum(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, local: Tensor) -> Tensor:
@@ -119,9 +167,36 @@ def gather(local: Tensor) -> Tensor:
     return _Gather.apply(local) if is_distributed() else local
 
 
+def begin_gather(local: Tensor) -> Callable[[], Tensor]:
+    """As `gather`, in two steps: what is computed before the returned function is called overlaps with the exchange,
+    and its backward with the exchange of the gradient. Call it once."""
+    if not is_distributed():
+        return lambda: local
+    exchange = _Started()
+    begun: Tensor = _Begin.apply(local, exchange)
+    return lambda: _End.apply(begun, exchange)
+
+
 def global_sum(local: Tensor) -> Tensor:
     """Sum over ranks of a tensor of the same shape on each, with gradient (backward: sum over ranks)."""
     return _Sum.apply(local) if is_distributed() else local
+
+
+class OnItsWay:
+    """Numbers of a device, copied to the host while both go on; `read` waits for what was computed before them."""
+
+    def __init__(self, numbers: Tensor) -> None:
+        self.numbers = numbers.detach().to("cpu", non_blocking=True)  # pinned memory; on a CPU the tensor itself
+        self.copied = torch.cuda.Event() if numbers.is_cuda else None
+        if self.copied is not None:
+            self.copied.record()
+
+    def read(self) -> list[float]:
+        """The numbers."""
+        if self.copied is not None:
+            self.copied.synchronize()
+        found: list[float] = self.numbers.tolist()
+        return found
 
 
 @torch.no_grad()

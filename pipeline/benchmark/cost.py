@@ -126,7 +126,7 @@ def collectives(sizes: StepSizes, w: int) -> list[Collective]:
         Collective("BatchNorm", "all_gather", w * 4 * (2 * channels + len(sizes.norms))),
         Collective("BatchNorm", "all_reduce", 4 * 2 * channels),
         Collective("gradients", "all_reduce", 4 * sizes.trained),
-        Collective("loss and stop flag", "all_reduce", 4 * (3 + sizes.passes) + 8),
+        Collective("loss, mining and stop flag", "all_reduce", 4 * (4 + sizes.passes)),
     ]
 
 

@@ -11,6 +11,7 @@ installed, and Pillow (`pipeline.common.pictures`, which also bounds the size) f
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -91,9 +92,16 @@ def to_tensor(pixels: NDArray[np.uint8]) -> Tensor:
 def normalise(images: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """uint8 [..., 3, H, W] -> (x / 255 - mean) / std with ImageNet's figures, on the images' device."""
     work = torch.float64 if dtype == torch.float64 else torch.float32  # the arithmetic is never in half precision
-    mean = torch.tensor(MEAN, dtype=work, device=images.device).view(3, 1, 1)
-    std = torch.tensor(STD, dtype=work, device=images.device).view(3, 1, 1)
+    mean, std = _constants(work, images.device)
     return ((images.to(work) / 255 - mean) / std).to(dtype)
+
+
+@cache
+def _constants(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """MEAN and STD [3, 1, 1], copied to a device once: the copy would stop the host at every step."""
+    with torch.inference_mode(False):  # a first call in inference would leave tensors that no other place may use
+        mean, std = (torch.tensor(figures, dtype=dtype, device=device).view(3, 1, 1) for figures in (MEAN, STD))
+    return mean, std
 
 
 def _fast_jpeg(data: bytes) -> NDArray[np.uint8] | None:

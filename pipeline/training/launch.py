@@ -101,7 +101,7 @@ def _deepspeed_on_cpu() -> None:
 
 @contextmanager
 def stop_signals() -> Iterator[list[int]]:
-    """Collects SIGTERM, SIGUSR1 and Ctrl-C in a list that the training loop looks at before each step.
+    """Collects SIGTERM, SIGUSR1 and Ctrl-C in a list that the training loop looks at in each step.
 
     A second Ctrl-C, a second or more after the first (a launcher may hand on the terminal's), ends at once.
     """

@@ -18,7 +18,22 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from pipeline.distributed import gather, is_distributed, rank, world_size
+from pipeline.distributed import OnItsWay, gather, is_distributed, rank, world_size
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a step tells the host, over the global batch and the same on every rank.
+
+    Attributes:
+        loss: its value.
+        mined: what mining kept.
+        flagged: how many ranks set their flag.
+    """
+
+    loss: float
+    mined: MiningStatistics
+    flagged: int
 
 
 @dataclass(frozen=True)
@@ -73,15 +88,16 @@ class MultiSimilarityLoss(nn.Module):
         self.alpha, self.beta, self.base, self.margin = alpha, beta, base, margin
         self.ignore_within = ignore_within
         self.register_buffer("points", points, persistent=False)
-        self._summary: tuple[int, Tensor] | None = None
+        self._summary: tuple[int, OnItsWay] | None = None
 
-    def forward(self, descriptors: Tensor, labels: Tensor) -> Tensor:
+    def forward(self, descriptors: Tensor, labels: Tensor, flag: bool = False) -> Tensor:
         """Loss of the global batch.
 
         Args:
             descriptors: [p*b, dim], this rank's rows, p descriptions of each image: all images in one way, then all in
                 the next (p = 1: [b, dim]). The same p and b on every rank.
             labels: [b] integers, the same number for the same place on every rank.
+            flag: what this rank has to tell the others, which `summary` counts.
 
         Returns:
             Scalar whose value is the mean over all p*B anchors (an anchor without mined pairs counts 0) and whose
@@ -121,11 +137,11 @@ class MultiSimilarityLoss(nn.Module):
 
         anchors = (positive.any(1) | negative.any(1)).view(passes, -1).sum(1)
         counts = torch.cat([anchors, positive.sum()[None], negative.sum()[None]])
-        # one small all-reduce carries the loss's global value and the mining counts
-        summary = torch.cat([local.detach()[None], counts.to(local.dtype)])
+        # one small all-reduce carries the loss's global value, the mining counts and the ranks' flags
+        summary = torch.cat([local.detach()[None], counts.to(local.dtype), local.new_full((1,), float(flag))])
         if is_distributed():
             dist.all_reduce(summary)
-        self._summary = (len(everyone), summary[1:])
+        self._summary = (len(everyone), OnItsWay(summary))
         return local + (summary[0] / world_size() - local.detach())
 
     def _near(self, labels: Tensor, everyone: Tensor) -> Tensor:
@@ -148,20 +164,26 @@ class MultiSimilarityLoss(nn.Module):
             negative & (similarity + self.margin > hardest_positive),
         )
 
-    def statistics(self) -> MiningStatistics:
-        """What the last forward mined, over the global batch (waits for the device).
+    def summary(self) -> Summary:
+        """What the last forward computed, over the global batch. Waits for that forward, and not for what the device
+        was given since: called after backward and update, it lets them go on.
 
         Raises:
             RuntimeError: before any forward.
         """
         if self._summary is None:
             raise RuntimeError("no batch has been through the loss yet")
-        total, counts = self._summary
-        *anchors, positives, negatives = counts.tolist()
+        total, numbers = self._summary
+        loss, *anchors, positives, negatives, flagged = numbers.read()
         each = total / len(anchors)
-        return MiningStatistics(
+        mined = MiningStatistics(
             sum(anchors) / total, tuple(n / each for n in anchors), positives / total, negatives / total
         )
+        return Summary(loss / world_size(), mined, int(flagged))
+
+    def statistics(self) -> MiningStatistics:
+        """What the last forward mined, as `summary` has it."""
+        return self.summary().mined
 
     @staticmethod
     def soft_sum(exponent: Tensor, mask: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -29,8 +29,7 @@ from pipeline.common.errors import DataError, Diverged, Interrupted, Preempted, 
 from pipeline.common.files import write_atomically
 from pipeline.config import RunConfig, flatten, recorded
 from pipeline.data.cliques import Mined
-from pipeline.data.images import normalise
-from pipeline.data.places import Batch, build_loader
+from pipeline.data.places import build_loader
 from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import open_shards
@@ -43,6 +42,7 @@ from pipeline.model.vpr import PlaceModel, build_model
 from pipeline.model.weights.convert import write_model
 from pipeline.model.weights.files import frozen_hash, load_model, load_trainable, save_model, saved_names
 from pipeline.training import checkpoint
+from pipeline.training.ahead import OnDevice, Ready
 from pipeline.training.checkpoint import RunState
 from pipeline.training.compiled import compile_backbone, uncompiled
 from pipeline.training.engines.base import Engine
@@ -122,6 +122,7 @@ class Trainer:
         self.samples: FileIO | None = None
         self.stops: list[int] = []  # signals received
         self.problem: Exception | None = None  # met between two exchanges of the ranks, told in the next
+        self.flagged = False  # whether any rank had something to tell in the last step
 
         if (numerics := set_numerics(config.train, accelerator.device)) and self.main:
             print(numerics, file=sys.stderr, flush=True)
@@ -242,11 +243,10 @@ class Trainer:
         self.engine.model.train()
         meter = Meter(config.data.places_per_batch * 4, self.total_steps, state, enabled=self.main)
         with meter:
-            for batch in self._agreed_batches(meter.wait(loader)):
+            for batch in self._agreed_batches(OnDevice(meter.wait(loader), self.accelerator.device)):
                 self._step(batch, meter)
-                if state.step >= self.total_steps and state.cursor < self.steps_per_epoch:
-                    break  # train.steps falls inside the epoch
-                if state.step % config.train.save_every == 0 and state.cursor < self.steps_per_epoch:
+                last = state.step >= self.total_steps or state.cursor >= self.steps_per_epoch
+                if state.step % config.train.save_every == 0 and not last:
                     self._save()
 
     def _mined(self) -> Mined | None:
@@ -263,48 +263,61 @@ class Trainer:
         if asked := self._exchange(self.problem):
             raise stop_at(asked, f"step {self.state.step}")
 
-    def _agreed_batches(self, batches: Iterator[Batch]) -> Iterator[Batch]:
-        """This rank's batches. Before each, the ranks tell each other, in one exchange, what keeps them from a step: a
-        batch that cannot be read, a sample log that cannot be written, a signal (saved, and raised)."""
-        while True:
-            batch: Batch | None = None
-            problem = self.problem
-            try:
-                batch = next(batches, None)
-            except Exception as error:
-                problem = problem or error
-            if asked := self._exchange(problem):
-                self._save()
-                raise stop_at(asked, f"step {self.state.step}")
-            if batch is None:
-                return
-            yield batch
+    def _agreed_batches(self, batches: OnDevice) -> Iterator[Ready]:
+        """This rank's batches. What keeps a rank from the next step (a batch that cannot be read, a sample log that
+        cannot be written, a signal: saved, and raised) the ranks tell each other with the loss of the step before,
+        for which every rank has its batch already. Before the first step and after the last they ask each other."""
+        coming = self._fetch(batches)
+        self._heed()
+        while coming is not None:
+            now = coming()
+            # one ahead, but no further than the run goes
+            coming = self._fetch(batches) if self.state.step + 1 < self.total_steps else None
+            yield now
+            if self.flagged or coming is None:
+                self._heed()
+
+    def _fetch(self, batches: OnDevice) -> Callable[[], Ready] | None:
+        try:
+            return batches.fetch()
+        except Exception as error:
+            self.problem = self.problem or error
+            return None
+
+    def _heed(self) -> None:
+        """Raises what any rank has to tell; a signal once the state, that of a finished step, is saved."""
+        if asked := self._exchange(self.problem):
+            self._save()
+            raise stop_at(asked, f"step {self.state.step}")
 
     def _exchange(self, problem: Exception | None) -> int:
         """The signal that any rank received, or 0; raises the problem of any rank on all."""
         return agree(problem, notice_of(self.stops), what=f"step {self.state.step + 1} of {self.run}")
 
-    def _step(self, batch: Batch, meter: Meter) -> None:
+    def _step(self, batch: Ready, meter: Meter) -> None:
+        """One step. What it tells is read once, when backward and update are on their way: a GPU never waits for the
+        host to read. So a loss that is not finite is seen after its update, which is never saved."""
         state, config = self.state, self.config
         torch.manual_seed(step_seed(config.seed, state.step, rank()))
-        images = normalise(batch.images.to(self.accelerator.device, non_blocking=True))
-        labels = batch.labels.to(self.accelerator.device, non_blocking=True)
         with self.accelerator.autocast():
-            descriptors = self.engine(images, chunk=config.train.encode_chunk, joint=config.train.passes == "joint")
-        loss = self.loss(descriptors, labels)
-        value = loss.detach().item()  # the global batch's loss, the same on every rank
-        if not math.isfinite(value):
-            raise Diverged(
-                f"the loss is {value} at step {state.step} (epoch {state.epoch}); the last good checkpoint of "
-                f"{self.run} stays; try a smaller --train.lr, --train.max_grad_norm 1.0 or --train.warmup_steps 500"
+            descriptors = self.engine(
+                batch.images, chunk=config.train.encode_chunk, joint=config.train.passes == "joint"
             )
+        loss = self.loss(descriptors, batch.labels, flag=self.problem is not None or bool(self.stops))
         rate = learning_rate(config.train, state.step, self.steps_per_epoch, self.total_steps)
         self.engine.step(loss, rate)
+        told = self.loss.summary()  # of the global batch, the same on every rank
+        if not math.isfinite(told.loss):
+            raise Diverged(
+                f"the loss is {told.loss} at step {state.step} (epoch {state.epoch}); the last good checkpoint of "
+                f"{self.run} stays; try a smaller --train.lr, --train.max_grad_norm 1.0 or --train.warmup_steps 500"
+            )
         state.step += 1
         state.cursor += 1
+        self.flagged = told.flagged > 0
         self._log_samples(batch.keys)
-        mined = self.loss.statistics()
-        meter.record(value, mined.by_pass, mined.negatives)
+        mined = told.mined
+        meter.record(told.loss, mined.by_pass, mined.negatives, batch.copy_wait())
         if state.step % config.train.log_every == 0 or state.step == self.total_steps:
             report = meter.report()
             self._record(
@@ -315,6 +328,7 @@ class Trainer:
                     "train/mined_negatives": report.negatives,
                     "train/images_per_second": report.images_per_second,
                     "train/data_wait": report.data_wait,
+                    "train/copy_wait": report.copy_wait,
                     "train/lr": rate,
                     "train/epoch": state.epoch + state.cursor / self.steps_per_epoch,
                 },

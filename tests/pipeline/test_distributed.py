@@ -13,7 +13,7 @@ import torch
 from processes import run_ranks
 
 from pipeline.common.errors import DataError, Interrupted, Unexpected, UsageError, UserError, told
-from pipeline.distributed import agree, agreed, broadcast_tensors, on_rank_0, rank, same
+from pipeline.distributed import agree, agreed, begin_gather, broadcast_tensors, gather, on_rank_0, rank, same
 
 
 def full_disk() -> None:
@@ -136,3 +136,27 @@ def test_only_what_a_user_can_mend_becomes_one_line() -> None:
     assert str(told(PermissionError(errno.EACCES, "Permission denied", "/data/x"), "reading /data/x")) == (
         "reading /data/x: Permission denied"
     )
+
+
+def test_a_gather_in_two_steps_is_the_gather() -> None:
+    """Value and gradient, also of what is computed in between."""
+
+    def both() -> list[torch.Tensor]:
+        torch.manual_seed(rank())
+        found: list[torch.Tensor] = []
+        local, weights = torch.randn(3, 4, dtype=torch.float64), torch.randn(2, 6, 4, dtype=torch.float64)
+        for kind in (gather, begin_gather):
+            x = local.clone().requires_grad_()
+            travelling = kind(2 * x)
+            between = (x**2).sum()
+            everyone = travelling if isinstance(travelling, torch.Tensor) else travelling()
+            (between + (weights[rank()] * everyone**2).sum()).backward()
+            assert x.grad is not None
+            found += [everyone.detach(), x.grad]
+        return found
+
+    ranks = run_ranks(both, 2)
+    for found in ranks:
+        assert torch.equal(found[0], found[2]) and torch.equal(found[1], found[3])
+        assert found[0].shape[0] == 6
+    assert not torch.equal(ranks[0][1], ranks[1][1])

@@ -1,7 +1,7 @@
 """What a person watches while training: step, time left, loss, recall so far, mined anchors, images a second, time
 spent waiting for data.
 
-Invariant: measuring adds no synchronisation of its own; the loss's value is fetched once a step by the loop.
+Invariant: measuring adds no synchronisation of its own; the loop reads a step's numbers once.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ class Report:
         negatives: mined negative pairs an anchor.
         images_per_second: over all ranks.
         data_wait: percent of the time spent waiting for the loader.
+        copy_wait: percent of the time in which the device waited for a batch that the loader had given already.
     """
 
     loss: float
@@ -35,6 +36,7 @@ class Report:
     negatives: float
     images_per_second: float
     data_wait: float
+    copy_wait: float
 
 
 class Meter:
@@ -54,7 +56,7 @@ class Meter:
         self._losses: list[float] = []
         self._mined: list[tuple[float, ...]] = []
         self._negatives: list[float] = []
-        self._waited = 0.0
+        self._waited = self._copying = 0.0
         self._since = time.perf_counter()
         self._shown: Report | None = None
 
@@ -76,8 +78,10 @@ class Meter:
             self._waited += time.perf_counter() - start
             yield batch
 
-    def record(self, loss: float, mined: tuple[float, ...], negatives: float) -> None:
-        """One step's loss, shares of anchors with a mined pair, mined negatives an anchor; moves the progress line."""
+    def record(self, loss: float, mined: tuple[float, ...], negatives: float, copy_wait: float = 0.0) -> None:
+        """One step's loss, shares of anchors with a mined pair, mined negatives an anchor, seconds in which the device
+        waited for the batch; moves the progress line."""
+        self._copying += copy_wait
         self._losses.append(loss)
         self._negatives.append(negatives)
         self._mined.append(tuple(100 * share for share in mined))
@@ -86,14 +90,15 @@ class Meter:
         self._bar.advance(
             1,
             f"loss {now.loss:.4f}  {recall_so_far(self.state)}mined {mined_now}, {now.negatives:.1f} negatives each  "
-            f"{now.images_per_second:.0f} images/s  data wait {now.data_wait:.0f}%",
+            f"{now.images_per_second:.0f} images/s  data wait {now.data_wait:.0f}%  "
+            f"copy wait {now.copy_wait:.0f}%",
         )
 
     def report(self) -> Report:
         """Means since the last report, and a new start."""
         report = self._current()
         self._losses, self._mined, self._negatives = [], [], []
-        self._waited, self._since = 0.0, time.perf_counter()
+        self._waited, self._copying, self._since = 0.0, 0.0, time.perf_counter()
         return report
 
     def _current(self) -> Report:
@@ -105,6 +110,7 @@ class Meter:
             sum(self._negatives) / n,
             self.images * len(self._losses) / seconds,
             100 * self._waited / seconds,
+            100 * self._copying / seconds,
         )
 
 

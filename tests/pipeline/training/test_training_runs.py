@@ -133,7 +133,7 @@ def test_a_signal_saves_and_leaves_with_75(root: Path, whole: str, number: signa
     kill_at(root, path, 2, number)
     seen = max(samples(root, name))
     saved = json.loads((root / "outputs" / name / "checkpoints/last/state.json").read_text())["state"]["step"]
-    assert 2 <= saved == seen <= 4, "saved within a step of the signal"
+    assert 2 <= saved == seen <= 5, "saved at the end of the step after the one that the signal came in"
     assert json.loads((root / "outputs" / name / "status.json").read_text())["exit_code"] == 75
     train(path)
     assert same_bits(weights(root, name), weights(root, whole))
