@@ -39,6 +39,18 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Published:
+    """Speed of the training step and of inference over the published code's, restated plainly; float32, same batch."""
+
+    size: Name = "vitb"
+    """Model and images, as in `step`."""
+    full: bool = False
+    """More rounds."""
+    device: Device = "auto"
+    """Where steps are computed; auto takes a GPU where there is one."""
+
+
+@dataclass(frozen=True)
 class Memory:
     """Bytes of a training step against the number of images, with and without chunks."""
 
@@ -225,6 +237,16 @@ def step(job: Step) -> None:
     print(timing.show(step.measure(size, device, _rounds(job.full), images, job.full)))
 
 
+def published(job: Published) -> None:
+    """Prints the machine, then the comparisons."""
+    from pipeline.benchmark import published, timing
+    from pipeline.benchmark.sizes import SIZES
+
+    size, device = SIZES[job.size], _device(job.device)
+    images = size.images_gpu if device.type == "cuda" else size.images
+    print(timing.show(published.measure(size, device, _rounds(job.full), images)))
+
+
 def memory(job: Memory) -> None:
     """Prints the machine, then the table."""
     from pipeline.benchmark import memory
@@ -318,6 +340,7 @@ def mine(job: Mine) -> None:
 
 PARTS: dict[str, tuple[type, Callable[[Any], None]]] = {
     "step": (Step, step),
+    "published": (Published, published),
     "memory": (Memory, memory),
     "precision": (Precision, precision),
     "data": (Data, data),

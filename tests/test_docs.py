@@ -76,6 +76,7 @@ SMALL = {
     "jobs.mine": "--workers 0",
     "jobs.benchmark mine": "--places 300 --dim 8 --places_per_batch 8",
     "jobs.benchmark step": "--size tiny --full false --device cpu",
+    "jobs.benchmark published": "--size tiny --device cpu",
     "jobs.benchmark memory": "--size tiny",
     "jobs.benchmark precision": "--size tiny --device cpu",
     "jobs.benchmark data": "--size tiny",

@@ -11,13 +11,13 @@ from collections.abc import Callable
 from typing import cast
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pipeline.common.errors import UsageError
 from pipeline.config import AdapterConfig
 from pipeline.model.batch_norm import GlobalBatchNorm2d, normalised_together
 from pipeline.model.pooling import Grid
+from pipeline.model.products import linear
 
 NORM_EPS = 1e-3  # published: BatchNorm2d(eps=0.001)
 
@@ -113,7 +113,7 @@ class ConvAdapter(nn.Module):
         hidden = torch.relu(self.down(x))
         first, second = self.steps()
         weight = torch.cat([step.conv.weight.flatten(1) for step in first])
-        products = F.linear(hidden, weight, torch.cat([cast(Tensor, step.conv.bias) for step in first]))
+        products = linear(hidden, weight, torch.cat([cast(Tensor, step.conv.bias) for step in first]))
         grid = products[:, self.others :].contiguous().unflatten(1, self.grid).permute(0, 3, 1, 2)
         maps = _normalised(first, grid).split([step.conv.out_channels for step in first], dim=1)
         ends = [part for part, path in zip(maps, self.paths, strict=True) if isinstance(path, ConvNorm)]

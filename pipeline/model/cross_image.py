@@ -19,7 +19,8 @@ from torch import Tensor, nn
 
 from pipeline.common.errors import UsageError
 from pipeline.config import CrossImageConfig
-from pipeline.distributed import gather
+from pipeline.distributed import begin_gather
+from pipeline.model.products import linear
 
 Memory = list[tuple[Tensor, Tensor]]
 """Keys and values of a bank's M images in each layer, [R, heads, M, D / heads] each."""
@@ -46,23 +47,26 @@ class CrossImageAttention(nn.Module):
         """
         together, dim = len(x) - alone, x.shape[-1]
         attended = []
-        if together:
+        if together and self.training:
             attended.append(self._over_all(x[:together]))
+        elif together:
+            query, key, value = linear(x[:together], self.in_proj_weight, self.in_proj_bias).chunk(3, dim=-1)
+            attended.append(self._attend(query, key, value))
         if alone:
-            attended.append(F.linear(x[together:], self.in_proj_weight[2 * dim :], self.in_proj_bias[2 * dim :]))
+            attended.append(linear(x[together:], self.in_proj_weight[2 * dim :], self.in_proj_bias[2 * dim :]))
         out: Tensor = self.out_proj(torch.cat(attended))
         return out
 
     def keys_values(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """What a bank's images are to others in this layer: [M, R, D] -> keys, values [R, heads, M, D / heads]."""
         dim = x.shape[-1]
-        key_value = F.linear(x, self.in_proj_weight[dim:], self.in_proj_bias[dim:])
+        key_value = linear(x, self.in_proj_weight[dim:], self.in_proj_bias[dim:])
         key, value = key_value.split(dim, dim=-1)
         return self._by_region(key), self._by_region(value)
 
     def beside(self, x: Tensor, keys: Tensor, values: Tensor) -> Tensor:
         """[b, R, D] -> [b, R, D]: each image over itself and over the keys and values of a bank."""
-        query, key, value = F.linear(x, self.in_proj_weight, self.in_proj_bias).chunk(3, dim=-1)
+        query, key, value = linear(x, self.in_proj_weight, self.in_proj_bias).chunk(3, dim=-1)
         query, key, value = self._by_region(query), self._by_region(key), self._by_region(value)
         itself = (query * key).sum(-1, keepdim=True)  # [R, heads, b, 1]
         scores = torch.cat((query @ keys.transpose(-1, -2), itself), dim=-1) * query.shape[-1] ** -0.5
@@ -72,13 +76,19 @@ class CrossImageAttention(nn.Module):
         return out
 
     def _over_all(self, x: Tensor) -> Tensor:
-        """[b, R, D] -> [b, R, D], before the output's projection."""
+        """[b, R, D] -> [b, R, D], before the output's projection: own queries over the global batch.
+
+        Keys and values are projected on the rank that owns the image, then gathered once, in the type in which they
+        were computed: the projection is not repeated W times. Own queries are projected while they travel.
+        """
         dim = x.shape[-1]
-        query, key_value = F.linear(x, self.in_proj_weight, self.in_proj_bias).split((dim, 2 * dim), dim=-1)
-        if self.training:
-            # projected on the rank that owns the image, then gathered once: the projection is not repeated W times
-            key_value = gather(key_value)
-        key, value = key_value.split(dim, dim=-1)
+        travelling = begin_gather(linear(x, self.in_proj_weight[dim:], self.in_proj_bias[dim:]))
+        query = linear(x, self.in_proj_weight[:dim], self.in_proj_bias[:dim])
+        key, value = travelling().split(dim, dim=-1)
+        return self._attend(query, key, value)
+
+    def _attend(self, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+        """[b, R, D], [B, R, D], [B, R, D] -> [b, R, D]."""
         query, key, value = self._by_region(query), self._by_region(key), self._by_region(value)
         dropout = self.dropout if self.training else 0.0
         attended = F.scaled_dot_product_attention(query, key, value, dropout_p=dropout)  # [R, heads, b, D / heads]

@@ -28,6 +28,7 @@ from pipeline.model.batch_norm import GlobalBatchNorm2d
 from pipeline.model.chunked import in_step, recomputed
 from pipeline.model.cross_image import CrossImageEncoder, Memory, check_crossing
 from pipeline.model.pooling import at_least_float32
+from pipeline.model.products import use_products
 
 Network = Backbone | ResNet | VGG | TransVPR
 BESIDE = 8  # images in a call beside a bank: one alone pays for eight, which is 5 % of its way through ViT-B
@@ -69,6 +70,7 @@ class PlaceModel(nn.Module):
         self.cross_image = CrossImageEncoder(self.pooling.dim, config.cross_image)
         self.regions = self.pooling.regions
         self.descriptor_dim = self.regions * self.pooling.dim
+        use_products(self)
 
     def encode(self, images: Tensor, chunk: int | None = None) -> Tensor:
         """Regional features of normalised images: [b, 3, H, W] -> [b, R, D].

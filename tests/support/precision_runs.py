@@ -36,7 +36,7 @@ def launch(config: Path, name: str, processes: int, *options: str, precision: st
         command += ["--main_process_port", str(free_port())]
     command += ["-m", "jobs.train", "--config", str(config), "--name", name, *options]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-3000:]
     return done.stdout + done.stderr
 

@@ -50,6 +50,7 @@ def test_a_machine_without_a_compiler_is_told_so(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)  # three trainings, two of which compile: minutes where other work runs beside
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a C++ compiler on CPU")
 def test_the_same_training_alone_and_under_ddp(tmp_path: Path) -> None:
     """The real job: three SGD steps without dropout, then weights, buffers, names and validated recalls agree."""
@@ -66,7 +67,15 @@ def test_the_same_training_alone_and_under_ddp(tmp_path: Path) -> None:
         found = weights(root, name)
         assert found.keys() == truth.keys()
         for key, value in truth.items():
-            torch.testing.assert_close(found[key], value, rtol=1e-3, atol=1e-5 if value.is_floating_point() else 0)
+            # a bias in front of a BatchNorm has no gradient but rounding, which compiled products do in another order
+            near = 1e-4 if key.endswith("conv.bias") else 1e-5
+            torch.testing.assert_close(
+                found[key],
+                value,
+                rtol=1e-3,
+                atol=near if value.is_floating_point() else 0,
+                msg=lambda m, k=key: f"{k}: {m}",
+            )
 
 
 def build_model_of(config: Path) -> dict[str, torch.Tensor]:
