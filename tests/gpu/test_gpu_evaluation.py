@@ -67,3 +67,26 @@ def test_pca_is_that_of_the_cpu(device: torch.device) -> None:
     truth, found = (fit_rows(lambda: slices(rows), np.arange(200), 6, device=where) for where in ("cpu", device))
     assert torch.allclose(truth.components, found.components, atol=1e-5)
     assert torch.allclose(truth.variances, found.variances, rtol=1e-5)
+
+
+def test_batches_copied_beside_a_step_are_the_loaders(device: torch.device) -> None:
+    """Two buffers for six batches, each fetched before the step of the one before it."""
+    from pipeline.data.images import normalise
+    from pipeline.data.places import Batch
+    from pipeline.training.ahead import OnDevice
+
+    def batch(number: int) -> Batch:
+        images = torch.full((4, 3, 64, 64), 40 * number, dtype=torch.uint8)
+        labels = torch.full((4,), number)
+        return Batch(*(t.pin_memory() if device.type == "cuda" else t for t in (images, labels)), [str(number)])
+
+    batches = OnDevice(map(batch, range(6)), device)
+    coming, found = batches.fetch(), []
+    while coming is not None:
+        now, coming = coming(), batches.fetch()
+        torch.ones(512, 512, device=device) @ torch.ones(512, 512, device=device)  # a step
+        found.append(now)
+    for number, ready in enumerate(found):
+        assert torch.allclose(ready.images.cpu(), normalise(batch(number).images), atol=1e-6)
+        assert ready.labels.tolist() == [number] * 4 and ready.keys == [str(number)] and ready.copy_wait() >= 0.0
+    assert len(found) == 6
