@@ -44,7 +44,7 @@ from pipeline.evaluation.search.projection import (
 )
 from pipeline.evaluation.search.rerank import build_reranker
 from pipeline.evaluation.search.rerank.second_stage import Described, rerank
-from pipeline.evaluation.sets.evaluation_set import EvaluationSet
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet, check_names
 from pipeline.evaluation.sets.load import load_set
 
 SIDES: tuple[Side, Side] = ("database", "queries")
@@ -122,6 +122,7 @@ def evaluate(
 
     Raises:
         DataError: images that cannot be read, descriptors that are not finite; the same on all ranks.
+        UsageError: two sets of one name.
     """
     model = getattr(model, "module", model)
     device = torch.device(device)
@@ -134,6 +135,7 @@ def evaluate(
         second = Described(build_reranker(model, config, device)) if config.rerank else None
         bank = None
         same(", ".join(evaluated.name for evaluated in sets), "the list of sets")
+        check_names(sets)
         for evaluated in sets:
             same(_names_digest(evaluated), f"the digest of the photo names of {evaluated.name}")
             if bank is None or config.bank_from == "map":  # only that one is another for each set

@@ -28,7 +28,7 @@ from pipeline.evaluation.identity import files_digest
 from pipeline.evaluation.protocol import protocols
 from pipeline.evaluation.report import paper_numbers, tables
 from pipeline.evaluation.report.paper_numbers import FIGURES, HEADLINE, Reported
-from pipeline.evaluation.sets.evaluation_set import EvaluationSet
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet, check_names
 from pipeline.evaluation.sets.load import load_set
 from pipeline.evaluation.sets.registry import published_name
 from pipeline.paper.measure import write_order
@@ -235,6 +235,7 @@ def build(
             table.sets[set_name] = load_set(set_name, evaluate)
         except (DataError, UsageError) as error:
             table.missing.append(str(error))
+    check_names(table.sets.values())
     fitted_on = None
     if any(release.method == HEADLINE for release in found):
         fitted_on = _pca_source(table, evaluate)

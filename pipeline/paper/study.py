@@ -16,7 +16,7 @@ from pathlib import Path
 from pipeline.common.errors import DataError, Diverged, UsageError
 from pipeline.config import EvaluationConfig, RunConfig
 from pipeline.evaluation.protocol import Protocol
-from pipeline.evaluation.sets.evaluation_set import EvaluationSet
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet, check_names
 from pipeline.evaluation.sets.load import load_set
 from pipeline.evaluation.sets.registry import published_name
 from pipeline.model.weights.where import HUB
@@ -174,6 +174,7 @@ def _sets(study: Study, evaluate: EvaluationConfig) -> None:
             study.sets[name] = load_set(name, evaluate)
         except (DataError, UsageError) as error:
             study.missing.append(str(error))
+    check_names(study.sets.values())
 
 
 def _weights(study: Study, base: RunConfig) -> None:

@@ -229,6 +229,12 @@ def test_dry_run_tells_rows_trainings_cost_and_what_is_missing(root: Path) -> No
     assert "did you mean 'spm'" in run(root, "smp", code=2)
 
 
+def test_two_sets_of_one_name_are_refused(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "evaluation").symlink_to(root / "evaluation")
+    both = f"{root / 'evaluation'},{tmp_path / 'evaluation'}"
+    assert "two sets are called 'evaluation'" in run(root, "spm", "--dry_run", "--sets", both, code=2)
+
+
 def test_pca_beyond_the_database_is_said_and_left_out(root: Path) -> None:
     filled = built(root, "dimensions")  # 14 x 16 = 224 dimensions, 16 database images
     assert [cell.config.pca for cell in filled.cells] == [11, 21, 43, 85, None]

@@ -7,13 +7,14 @@ row of the database, all files listed in the order in which groups are formed. N
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 
-from pipeline.common.errors import DataError
+from pipeline.common.errors import DataError, UsageError
 from pipeline.common.text import shown
 from shards.sources.listing import walk
 
@@ -90,6 +91,23 @@ def _unreadable(error: OSError) -> NoReturn:
 
 def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(run), "") if run.isdigit() else (-1, run) for run in re.split(r"(\d+)", str(path))]
+
+
+def check_names(sets: Iterable[EvaluationSet]) -> None:
+    """Refuses two sets of one name: recalls, predictions and metrics are known by it, so they would mix.
+
+    Raises:
+        UsageError: with the name and the folders.
+    """
+    seen: dict[str, EvaluationSet] = {}
+    for one in sets:
+        other = seen.setdefault(one.name, one)
+        if other is not one:
+            folders = " and ".join(shown(s.database[0].parent) for s in (other, one))
+            raise UsageError(
+                f"two sets are called '{one.name}' ({folders}): their results would have one name; evaluate one "
+                "of them under another folder name, for example through a symbolic link"
+            )
 
 
 def clean_name(text: str) -> str:

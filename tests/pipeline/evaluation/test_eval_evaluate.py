@@ -15,7 +15,7 @@ import torch.multiprocessing as mp
 from PIL import Image
 from torch import Tensor, nn
 
-from pipeline.common.errors import DataError
+from pipeline.common.errors import DataError, UsageError
 from pipeline.config import EvaluationConfig
 from pipeline.data.images import load_image, normalise, to_input
 from pipeline.evaluation.describe.stored import evaluate_stores
@@ -141,6 +141,13 @@ def test_parts_are_searched_apart(tmp_path: Path) -> None:
     apart = dataclasses.replace(evaluated, database_part=parts, query_part=np.zeros(13, np.int64))
     result = evaluate(Tiny(), [apart], CONFIG, "cpu", progress=False)[0]
     assert (parts[result.predictions] == 0).all()
+
+
+def test_two_sets_of_one_name_are_refused(tmp_path: Path) -> None:
+    """Their recalls, predictions and metrics would have one name."""
+    sets = [make_set(tmp_path / town) for town in ("a", "b")]
+    with pytest.raises(UsageError, match=f"two sets are called 'fields' .*{tmp_path}/a.* and .*{tmp_path}/b"):
+        evaluate(Tiny(), sets, CONFIG, "cpu", progress=False)
 
 
 def test_store_is_reused_and_gives_the_same_results(tmp_path: Path) -> None:
