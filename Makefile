@@ -26,7 +26,7 @@ lint: $(STAMP)
 setup: $(STAMP)
 
 # constraints.txt pins every version; torch==2.13.0 takes a CPU build where pip is told of one, CUDA's elsewhere
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml constraints.txt Makefile
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade "pip>=25"
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable ".[dev,deepspeed,onnx,rerank]"
