@@ -230,9 +230,15 @@ def test_dry_run_tells_rows_trainings_cost_and_what_is_missing(root: Path) -> No
 
 
 def test_two_sets_of_one_name_are_refused(root: Path, tmp_path: Path) -> None:
+    settings(root)
     (tmp_path / "evaluation").symlink_to(root / "evaluation")
     both = f"{root / 'evaluation'},{tmp_path / 'evaluation'}"
     assert "two sets are called 'evaluation'" in run(root, "spm", "--dry_run", "--sets", both, code=2)
+    (tmp_path / "elsewhere").symlink_to(root / "evaluation")
+    told = run(
+        root, "spm", "--dry_run", "--sets", both.replace(str(tmp_path / "evaluation"), str(tmp_path / "elsewhere"))
+    )
+    assert "elsewhere: " in told and "evaluation: " in told
 
 
 def test_pca_beyond_the_database_is_said_and_left_out(root: Path) -> None:

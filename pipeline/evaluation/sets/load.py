@@ -7,6 +7,7 @@ the same; a set that is missing or malformed raises `DataError` naming the folde
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -197,7 +198,8 @@ def _contents(path: Path) -> str:
 
 def _path_name(path: Path) -> str:
     """The dataset's folder: .../miniature for .../miniature/images/val as well."""
-    whole = path.resolve()
+    # not resolve(): a symbolic link has a name of its own
+    whole = Path(os.path.abspath(path))  # noqa: PTH100
     named = whole.with_suffix("") if whole.is_file() else whole
     parts = [part for part in named.parts if part not in ("images", "processed", *SPLITS)]
     return clean_name(parts[-1] if parts else "set")
