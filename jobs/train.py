@@ -55,7 +55,7 @@ def main() -> None:
 
             if first and (remark := random_and_frozen(config.model)):
                 print(f"warning: {remark}", file=sys.stderr)
-            rows = preview(config)  # on all ranks: the model's forward pass has collectives
+            rows = preview(config, accelerator)  # on all ranks: the model's forward pass has collectives
             if first:
                 print(show(rows))
             return

@@ -1,13 +1,15 @@
 """What a run would be, before it starts: batches, steps, parameters, memory, disk (`jobs.train --dry_run`).
 
 Invariant: nothing is written. Counts are exact; activation memory is measured on one small batch of the real model
-(bytes that autograd keeps for backward) and scaled to the run's batch, so it is an estimate and is called one.
+(bytes that autograd keeps for backward) and scaled to the run's batch, so it is an estimate and is called one, as is
+the time of an epoch (pipeline.training.epoch_time).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -16,9 +18,10 @@ from pipeline.config import RunConfig
 from pipeline.data.plan import plan
 from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import ShardSets, open_shards
-from pipeline.distributed import agreed, collective_device, world_size
+from pipeline.distributed import agreed, world_size
 from pipeline.evaluation.search.projection import check_prefix
 from pipeline.model.vpr import PlaceModel, build_model, parameter_counts
+from pipeline.training.epoch_time import step_time
 from pipeline.training.mining import Mining
 from shards.index import ShardIndex
 
@@ -44,8 +47,8 @@ def saved_bytes(model: PlaceModel, images: int, joint: bool = False) -> int:
     return sum(seen.values())
 
 
-def preview(config: RunConfig) -> list[tuple[str, str]]:
-    """Rows (what, value) of the plan of a run. Collective.
+def preview(config: RunConfig, accelerator: Any) -> list[tuple[str, str]]:
+    """Rows (what, value) of the plan of a run on the accelerator's device. Collective.
 
     Raises:
         UsageError, DataError: whatever would stop the run at its start.
@@ -64,7 +67,11 @@ def preview(config: RunConfig) -> list[tuple[str, str]]:
         ("parameters", f"{counts['total']:,}: {counts['trainable']:,} trained, "
                        f"{counts['total'] - counts['trainable']:,} frozen"),
     ]  # fmt: skip
-    return rows + _size_rows(config, model, counts)
+    rows += _size_rows(config, model.to(accelerator.device), counts)
+    steps = len(
+        plan(index, config.seed, 0, config.data.places_per_batch, config.data.order, config.data.window_shards).batches
+    )
+    return rows + step_time(config, index, model, accelerator).rows(steps)
 
 
 def _plan_rows(config: RunConfig, index: ShardIndex) -> list[tuple[str, str]]:
@@ -97,7 +104,7 @@ def _plan_rows(config: RunConfig, index: ShardIndex) -> list[tuple[str, str]]:
 
 def _size_rows(config: RunConfig, model: PlaceModel, counts: dict[str, int]) -> list[tuple[str, str]]:
     trained, w = counts["trainable"], world_size()
-    model.to(collective_device()).train()  # its forward holds collectives of all ranks
+    model.train()  # its forward holds collectives of all ranks
     joint = config.train.passes == "joint"
     one, three = saved_bytes(model, 4, joint), saved_bytes(model, 8, joint)
     each = max(0, three - one) / 4

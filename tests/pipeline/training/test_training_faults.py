@@ -276,7 +276,7 @@ def test_a_broken_member_ends_both_processes_of_the_job(root: Path) -> None:
 def test_dry_run_on_two_processes(root: Path) -> None:
     job = Launched("ddp", 2, "jobs.train", ["--config", str(written(root, "dry")), "--dry-run"], root / "dry.log")
     said = job.done()
-    assert "2, 8 images each" in said and "memory a process" in said
+    assert "2, 8 images each" in said and "memory a process" in said and "time an epoch" in said
     assert "memory a process" not in job.ranks[1].text()
     assert not (root / "outputs/dry").exists()
 

@@ -206,6 +206,8 @@ def test_dry_run_tells_the_plan_and_writes_nothing(root: Path) -> None:
     short = train(config(root, "dry"), "--dry-run", "--loss.prefixes", "8,9999", code=2)
     assert "loss.prefixes 9999: the descriptors have" in short
     assert re.search(r"epoch\s+6 steps; 0 places wait", out)
+    assert re.search(r"time a step\s+about [0-9.e-]+ s of computation .*measured.* s to read its images by", out)
+    assert re.search(r"time an epoch\s+about \d.* s, bound by (computation|reading)", out)
     assert re.search(r"global batch\s+4 places x 4 = 16 images", out)
     assert not (root / "outputs/dry").exists()
 
