@@ -45,6 +45,7 @@ ELSEWHERE = {
     "python -m jobs.evaluate --checkpoint CricaVPR.pth": "it needs the authors' file",
     "python -m jobs.locate --checkpoint outputs/cricavpr --index outputs/my_index --serve":
         "tests/jobs/test_job_locate.py",
+    "python -m jobs.experiment --table mined": "tests/jobs/test_job_experiment.py",
     "python -m pytest tests/gpu": "it needs a GPU",
     "docker": "it needs Docker; tests/jobs/test_container.py runs the entry point",
     "mlflow artifacts download": "tests/pipeline/training/records/test_records_tracking.py",

@@ -67,8 +67,9 @@ def test_the_same_training_alone_and_under_ddp(tmp_path: Path) -> None:
         found = weights(root, name)
         assert found.keys() == truth.keys()
         for key, value in truth.items():
-            # a bias in front of a BatchNorm has no gradient but rounding, which compiled products do in another order
-            near = 1e-4 if key.endswith("conv.bias") else 1e-5
+            # adapters: a bias before a BatchNorm has no gradient but rounding; nor has a BatchNorm's own bias where its
+            # channel is all but constant, so that rounding decides which values ReLU cuts
+            near = 1e-4 if ".adapter." in key and key.endswith(".bias") else 1e-5
             torch.testing.assert_close(
                 found[key],
                 value,
