@@ -144,7 +144,8 @@ def build(
                 if cell.impossible:
                     study.notes[label] = cell.impossible
                 study.settings[label] = own_settings(row, found, base, cell.config)
-            if found.config.model.backbone.name.startswith("resnet") and resnet_weights is None:
+            backbone = found.config.model.backbone
+            if backbone.name.startswith("resnet") and backbone.weights is None:
                 study.notes.setdefault(label, "a residual network from random weights; give --resnet_weights")
             study.settings.setdefault(label, own_settings(row, found, base, None))
     # several PCAs of the same images: described once, kept until all are done

@@ -139,7 +139,8 @@ def test_what_fails_on_one_rank_ends_both_alike(run_folder: Path, monkeypatch: p
     from pipeline.evaluation.sets import load
     from pipeline.model.weights import load as weights
 
-    asked = {"groups": ("single",), "sets": ("aisle", "aisle"), "root": str(run_folder / "data"), "workers": 0}
+    (run_folder / "data" / "twin").symlink_to(run_folder / "data" / "aisle")
+    asked = {"groups": ("single",), "sets": ("aisle", "twin"), "root": str(run_folder / "data"), "workers": 0}
     config = EvaluationConfig(**asked, recalls=(1,))
     read_sets, write_all = load.load_sets, predictions.save_results
 
@@ -156,7 +157,7 @@ def test_what_fails_on_one_rank_ends_both_alike(run_folder: Path, monkeypatch: p
     faults = {
         "model": (1, weights, "load_any", broken, "rank 1: this disk is broken"),
         "sets": (1, load, "load_sets", broken, "rank 1: this disk is broken"),
-        "fewer sets": (1, load, "load_sets", fewer, "rank 1: the list of sets is aisle here and aisle, aisle on rank"),
+        "fewer sets": (1, load, "load_sets", fewer, "rank 1: the list of sets is aisle here and aisle, twin on rank"),
         "full disk": (0, predictions, "save_results", full, f"rank 0: writing the results into {run_folder}"),
     }
 
