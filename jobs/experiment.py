@@ -15,8 +15,10 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from jobs.cli import parse, run_job
 from pipeline.common.errors import DataError, UsageError
@@ -81,15 +83,10 @@ def main() -> None:
     runner = Runner(Path(job.output), job.launch)
     shards = {"pitts30k_shards": job.pitts30k_shards}
     filled = study.build(job.table, wanted_table, base, wanted, job.seeds, runner, shards, job.resnet_weights)
-    if job.dry_run:
-        print(table_report.costs(filled, job.images_per_second))
+    nothing = "" if filled.sets else "no evaluation set of the table is there: give --root or --sets ({})"
+    folder = fill(job, filled, table_report.costs, nothing)
+    if folder is None:
         return
-    for line in filled.missing:
-        print(f"missing: {line}", file=sys.stderr)
-    if not filled.sets:
-        raise DataError(f"no evaluation set of the table is there: give --root or --sets ({'; '.join(filled.missing)})")
-    filled.fill()
-    folder = Path(job.output) / "tables" / job.table
     compared = list(paired.paired(filled))
     table_report.write(filled, compared, folder)
     table_report.show(filled, compared)
@@ -107,18 +104,33 @@ def compare(job: ExperimentJob) -> None:
 
     wanted = dataclasses.replace(job.evaluate, sets=job.sets, root=job.root)
     filled = released_table.build(job.table, Path(job.released), wanted, Runner(Path(job.output), job.launch), job.rows)
-    if job.dry_run:
-        print(released_table.costs(filled, job.images_per_second))
+    folder = fill(
+        job, filled, released_table.costs, "" if filled.cells else "nothing of the table can be evaluated: {}"
+    )
+    if folder is None:
         return
-    for line in filled.missing:
-        print(f"missing: {line}", file=sys.stderr)
-    if not filled.cells:
-        raise DataError(f"nothing of the table can be evaluated: {'; '.join(filled.missing)}")
-    filled.fill()
-    folder = Path(job.output) / "tables" / job.table
     released_table.write(filled, folder)
     released_table.show(filled)
     print(f"\nwritten to {folder}/: table.md, table.csv, results/")
+
+
+def fill(job: ExperimentJob, table: Any, costs: Callable[[Any, float | None], str], nothing: str) -> Path | None:
+    """Fills a table of either kind; the folder to write it to, None where only its costs were asked for.
+
+    Args:
+        table: has `missing` and `fill()`.
+        costs: tells the costs of such a table.
+        nothing: the error where nothing of it can be filled, with {} for what is missing; else empty.
+    """
+    if job.dry_run:
+        print(costs(table, job.images_per_second))
+        return None
+    for line in table.missing:
+        print(f"missing: {line}", file=sys.stderr)
+    if nothing:
+        raise DataError(nothing.format("; ".join(table.missing)))
+    table.fill()
+    return Path(job.output) / "tables" / job.table
 
 
 def measure(order: Path, timeout: float) -> None:

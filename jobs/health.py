@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jobs.cli import parse, run_job
+from pipeline.common.cores import available_cores
 from pipeline.common.errors import UsageError
 from pipeline.common.files import check_writable
 
@@ -41,7 +42,7 @@ def main() -> None:
     shared = shutil.disk_usage(SHARED).total if SHARED.is_dir() else 0
     small = "" if shared >= ENOUGH else " (loader processes may need more: docker run --shm-size 8g)"
     print(
-        f"ok: torch {torch.__version__}, {found} GPUs, {len(os.sched_getaffinity(0))} cores, "
+        f"ok: torch {torch.__version__}, {found} GPUs, {available_cores()} cores, "
         f"{shared / 1e6:,.0f} MB in {SHARED}{small}, {job.output} writable by user {os.getuid()}"
     )
 

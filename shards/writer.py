@@ -27,6 +27,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from pipeline.common import files
+from pipeline.common.cores import available_cores
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import locked, write_atomically
 from pipeline.common.progress import Progress
@@ -279,7 +280,7 @@ def _write_groups(plan: groups.GroupPlan, out: Path, rule: WriteRule, part: int,
     """Writes the groups of a part, in processes; yields the photos of each as it is finished."""
     tasks = plan.tasks(out, rule.seed, rule.rounds, rule.image, part, parts)
     worth = 1 + plan.source_bytes // parts // _BYTES_A_WORKER
-    workers = min(rule.workers or min(len(os.sched_getaffinity(0)), worth), len(plan))
+    workers = min(rule.workers or min(available_cores(), worth), len(plan))
     if workers == 1:
         yield from map(groups.write_group, tasks)
         return

@@ -7,7 +7,6 @@ set written from them; files were just written, so the page cache holds them and
 from __future__ import annotations
 
 import io
-import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +20,7 @@ import torch
 from PIL import Image
 
 from pipeline.benchmark.timing import Comparison, compare, from_seconds
+from pipeline.common.cores import available_cores
 from pipeline.config import DataConfig
 from pipeline.data.augment import Augment, Draws, training_view
 from pipeline.data.images import decode, shrink
@@ -117,7 +117,7 @@ def loading(index: ShardIndex, data: DataConfig, rounds: int, workers: tuple[int
             start = time.perf_counter()
             images = sum(len(batch.images) for batch in batches)
             seconds[f"{n} workers"].append(time.perf_counter() - start)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = available_cores()
     return from_seconds(f"the loader, RandAugment, {cores} cores", seconds, images)
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import torch
 
+from pipeline.common.cores import available_cores
 from pipeline.common.text import Table
 
 HEADER = ("", "ms", "per second", "speed (lowest-highest)")
@@ -115,7 +116,7 @@ def show(comparisons: list[Comparison]) -> str:
 
 def machine(device: torch.device) -> str:
     """One line: what these figures were measured on."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = available_cores()
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     named = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else "no GPU, "
     return (

@@ -262,9 +262,8 @@ def answer_queries(
     PCA is fitted on the set's own database where the protocol asks for PCA and none is given.
     """
     database, queries = _shortened(evaluated, protocol, described, fitted)
-    k = max(*config.recalls, protocol.rerank)
-    found = np.full((len(evaluated.queries), k), -1, np.int64)
-    distances = np.full((len(evaluated.queries), k), np.inf, np.float32)
+    found, distances = _none_yet(evaluated, protocol, config)
+    k = found.shape[1]
     parts = evaluated.database_part, evaluated.query_part
     clock, within = Clock(), parts[0] is not None and parts[1] is not None
     if within or protocol.search == "exact":
@@ -295,6 +294,12 @@ def answer_queries(
     return Answers(found, distances, (f"{remark} {index_bytes(index) / 1e6:,.1f} MB",), cost)
 
 
+def _none_yet(evaluated: EvaluationSet, protocol: Protocol, config: EvaluationConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Room for the rows int64 and the distances float32 [Q, k] of as many answers as are asked for."""
+    shape = (len(evaluated.queries), max(*config.recalls, protocol.rerank))
+    return np.full(shape, -1, np.int64), np.full(shape, np.inf, np.float32)
+
+
 def on_devices(device: torch.device, evaluated: EvaluationSet, protocol: Protocol) -> bool:
     """Whether the ranks' GPUs search: exactly, and in the whole database. faiss does everything else."""
     return device.type == "cuda" and protocol.search == "exact" and evaluated.database_part is None
@@ -312,9 +317,7 @@ def answer_on_devices(
     sides: list[Blocks] = []
     on_rank_0(lambda: sides.extend(_shortened(evaluated, protocol, described, fitted)))
     coming = batches(sides[1]) if sides else iter(())
-    k = max(*config.recalls, protocol.rerank)
-    found = np.full((len(evaluated.queries), k), -1, np.int64)
-    distances = np.full((len(evaluated.queries), k), np.inf, np.float32)
+    found, distances = _none_yet(evaluated, protocol, config)
     taken: list[np.ndarray] = []
 
     def take() -> np.ndarray | None:
@@ -324,7 +327,7 @@ def answer_on_devices(
 
     while (numbers := on_rank_0(take)) is not None:
         asked, database = (taken[0], sides[0]) if sides else (None, None)
-        distances[numbers], found[numbers] = search_on_devices(asked, database, k, device)
+        distances[numbers], found[numbers] = search_on_devices(asked, database, found.shape[1], device)
     return Answers(found, distances)
 
 

@@ -28,11 +28,12 @@ from pipeline.evaluation.identity import files_digest
 from pipeline.evaluation.protocol import protocols
 from pipeline.evaluation.report import paper_numbers, tables
 from pipeline.evaluation.report.paper_numbers import FIGURES, HEADLINE, Reported
-from pipeline.evaluation.sets.evaluation_set import EvaluationSet, check_names
-from pipeline.evaluation.sets.load import load_set
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
+from pipeline.evaluation.sets.load import load_set, sets_there
 from pipeline.evaluation.sets.registry import published_name
 from pipeline.paper.measure import write_order
 from pipeline.paper.plan import dimensions
+from pipeline.paper.rows import check_rows
 from pipeline.paper.runner import Runner
 
 ENDINGS = (".pth", ".tar", ".safetensors")
@@ -224,18 +225,12 @@ def build(
         UsageError: a method that the table does not have, or no released file in the folder.
     """
     whole = COMPARISONS[name]
-    for row in rows:
-        if row not in whole.methods:
-            raise UsageError(f"--rows: the table has no row '{row}'; it has {', '.join(map(repr, whole.methods))}")
+    check_rows(rows, whole.methods)
     methods = tuple(method for method in whole.methods if method in rows or not rows)
     table = ReleasedTable(name, dataclasses.replace(whole, methods=methods), runner)
     found, table.missing = releases_in(folder)
-    for set_name in evaluate.sets or table.comparison.sets:
-        try:
-            table.sets[set_name] = load_set(set_name, evaluate)
-        except (DataError, UsageError) as error:
-            table.missing.append(str(error))
-    check_names(table.sets.values())
+    table.sets, missing = sets_there(evaluate.sets or table.comparison.sets, evaluate)
+    table.missing += missing
     fitted_on = None
     if any(release.method == HEADLINE for release in found):
         fitted_on = _pca_source(table, evaluate)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -221,9 +221,14 @@ def table(name: str) -> Table:
     raise UsageError(f"unknown table '{name}'; {hint}known: {', '.join(TABLES)}, sota, challenging")
 
 
+def check_rows(names: Sequence[str], known: Collection[str]) -> None:
+    """Raises `UsageError` for a row that a table does not have."""
+    for name in names:
+        if name not in known:
+            raise UsageError(f"--rows: the table has no row '{name}'; it has {', '.join(map(repr, known))}")
+
+
 def with_rows(whole: Table, names: Sequence[str]) -> Table:
     """The table with the rows of these names alone, in its own order. Raises `UsageError` for one it does not have."""
-    for name in names:
-        if name not in whole.rows:
-            raise UsageError(f"--rows: the table has no row '{name}'; it has {', '.join(map(repr, whole.rows))}")
+    check_rows(names, whole.rows)
     return dataclasses.replace(whole, rows={name: row for name, row in whole.rows.items() if name in names})

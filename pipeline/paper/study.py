@@ -13,11 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pipeline.common.errors import DataError, Diverged, UsageError
+from pipeline.common.errors import DataError, Diverged
 from pipeline.config import EvaluationConfig, RunConfig
 from pipeline.evaluation.protocol import Protocol
-from pipeline.evaluation.sets.evaluation_set import EvaluationSet, check_names
-from pipeline.evaluation.sets.load import load_set
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet
+from pipeline.evaluation.sets.load import sets_there
 from pipeline.evaluation.sets.registry import published_name
 from pipeline.model.weights.where import HUB
 from pipeline.paper.plan import Cell, Training, distinct, evaluation, own_settings, training
@@ -127,7 +127,7 @@ def build(
         resnet_weights: for rows on a residual network; None: random weights.
     """
     study = Study(name, table, tuple(dict.fromkeys(seeds)), runner)
-    _sets(study, evaluate)
+    study.sets, study.missing = sets_there(evaluate.sets or table.sets, evaluate)
     _weights(study, base)
     for label, row in table.rows.items():
         own = (shards or {}).get(row.needs, "")
@@ -167,15 +167,6 @@ def _cell(
     if config.pca and not config.pca_from and config.pca > len(loaded.database):
         impossible = f"PCA {config.pca} needs as many images; {loaded.name} has a database of {len(loaded.database):,}"
     return Cell(label, found, set_name, config, impossible)
-
-
-def _sets(study: Study, evaluate: EvaluationConfig) -> None:
-    for name in evaluate.sets or study.table.sets:
-        try:
-            study.sets[name] = load_set(name, evaluate)
-        except (DataError, UsageError) as error:
-            study.missing.append(str(error))
-    check_names(study.sets.values())
 
 
 def _weights(study: Study, base: RunConfig) -> None:

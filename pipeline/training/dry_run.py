@@ -15,7 +15,7 @@ import torch
 
 from pipeline.common.text import Table, without_passwords
 from pipeline.config import RunConfig
-from pipeline.data.plan import plan
+from pipeline.data.plan import EpochPlan, plan
 from pipeline.data.positions import place_points
 from pipeline.data.shard_sets import ShardSets, open_shards
 from pipeline.distributed import agreed, world_size
@@ -54,7 +54,9 @@ def preview(config: RunConfig, accelerator: Any) -> list[tuple[str, str]]:
         UsageError, DataError: whatever would stop the run at its start.
     """
     index = agreed(lambda: open_shards(config.data), what=f"reading {config.data.shards}")
-    rows = _plan_rows(config, index)
+    data = config.data
+    first = plan(index, config.seed, 0, data.places_per_batch, data.order, data.window_shards)
+    rows = _plan_rows(config, index, first)
     torch.manual_seed(config.seed)
     shapes = replace(
         config.model, backbone=replace(config.model.backbone, weights=None)
@@ -68,17 +70,13 @@ def preview(config: RunConfig, accelerator: Any) -> list[tuple[str, str]]:
                        f"{counts['total'] - counts['trainable']:,} frozen"),
     ]  # fmt: skip
     rows += _size_rows(config, model.to(accelerator.device), counts)
-    steps = len(
-        plan(index, config.seed, 0, config.data.places_per_batch, config.data.order, config.data.window_shards).batches
-    )
-    return rows + step_time(config, index, model, accelerator).rows(steps)
+    return rows + step_time(config, index, model, accelerator).rows(len(first.batches))
 
 
-def _plan_rows(config: RunConfig, index: ShardIndex) -> list[tuple[str, str]]:
+def _plan_rows(config: RunConfig, index: ShardIndex, first: EpochPlan) -> list[tuple[str, str]]:
     data, w = config.data, world_size()
     if config.loss.ignore_within:
         place_points(index, f"loss.ignore_within={config.loss.ignore_within:g}")
-    first = plan(index, config.seed, 0, data.places_per_batch, data.order, data.window_shards)
     steps = len(first.batches)
     images = 4 * data.places_per_batch
     total = steps * config.train.epochs

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from pipeline.common.cores import available_cores
 from pipeline.common.progress import duration
 from pipeline.config import RunConfig
 from pipeline.data.places import build_loader
@@ -83,7 +84,7 @@ def step_time(config: RunConfig, index: ShardIndex, model: PlaceModel, accelerat
     images = 4 * config.data.places_per_batch // world_size()
     compute, tried = _compute(config, model, accelerator, images)
     read = agreed(lambda: _read(config, index), what=f"reading a batch of {config.data.shards}")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = available_cores()
     most = max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
     return StepTime(compute, tried, images, read, min(config.data.workers, most))
 

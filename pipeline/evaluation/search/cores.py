@@ -12,6 +12,8 @@ from contextlib import contextmanager
 
 import torch
 
+from pipeline.common.cores import available_cores
+
 
 @contextmanager
 def all_cores(faiss: bool = False) -> Iterator[None]:
@@ -20,7 +22,7 @@ def all_cores(faiss: bool = False) -> Iterator[None]:
     if int(os.environ.get("LOCAL_WORLD_SIZE", "1")) == 1:
         yield
         return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = available_cores()
     counts: list[tuple[Callable[[], int], Callable[[int], None]]] = [(torch.get_num_threads, torch.set_num_threads)]
     if faiss:
         import faiss as library

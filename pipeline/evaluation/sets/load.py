@@ -16,7 +16,7 @@ from pipeline.common.errors import DataError, UsageError
 from pipeline.common.text import shown
 from pipeline.config import EvaluationConfig
 from pipeline.evaluation.sets import layouts, msls
-from pipeline.evaluation.sets.evaluation_set import EvaluationSet, clean_name, list_images
+from pipeline.evaluation.sets.evaluation_set import EvaluationSet, check_names, clean_name, list_images
 from pipeline.evaluation.sets.fixed_lists import SPLITS, Lists, find_lists, from_lists, photos_there
 from pipeline.evaluation.sets.manifest import SUFFIXES, from_manifest, manifest_in
 from pipeline.evaluation.sets.registry import SETS, count_remark, key, published_name
@@ -74,6 +74,22 @@ def load_sets(names: Sequence[str], config: EvaluationConfig) -> tuple[list[Eval
     if not sets:
         raise DataError("; ".join(left_out) or f"no evaluation set under {config.root}/: give --sets or --root")
     return sets, left_out
+
+
+def sets_there(names: Sequence[str], config: EvaluationConfig) -> tuple[dict[str, EvaluationSet], list[str]]:
+    """(Name as given -> the set, of those that are there; a line for each that is not).
+
+    Raises:
+        UsageError: two sets of one name.
+    """
+    sets, missing = {}, []
+    for name in names:
+        try:
+            sets[name] = load_set(name, config)
+        except (DataError, UsageError) as error:
+            missing.append(str(error))
+    check_names(sets.values())
+    return sets, missing
 
 
 def _load_published(name: str, folder: Path, config: EvaluationConfig, route: str) -> EvaluationSet:

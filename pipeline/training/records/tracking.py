@@ -195,7 +195,7 @@ class Tracker:
         """Records metrics at a step, in the background."""
         if self._client is None:
             return
-        with self._recording(f"metrics of step {step}"):
+        with _recording(f"metrics of step {step}"):
             from mlflow.entities import Metric
 
             now = int(time.time() * 1000)
@@ -206,7 +206,7 @@ class Tracker:
         """Registers a checkpoint folder as a logged model of the run, ranked by its validation figures."""
         if self._client is None:
             return
-        with self._recording(f"checkpoint of step {step}"):
+        with _recording(f"checkpoint of step {step}"):
             from mlflow.entities import LoggedModelStatus, Metric
 
             model = self._client.create_logged_model(
@@ -234,12 +234,12 @@ class Tracker:
         """
         if self._client is None:
             return
-        with self._recording("the log of the run"):
+        with _recording("the log of the run"):
             add_artifacts(self._client, self.run_id, [self._folder() / "train.log"], "training")
         name = self.config.tracking.register
         if name is None or whole is None:
             return
-        with self._recording(f"the model {name}"), tempfile.TemporaryDirectory() as folder:
+        with _recording(f"the model {name}"), tempfile.TemporaryDirectory() as folder:
             whole(Path(folder))
             self._register(name, Path(folder))
 
@@ -276,21 +276,23 @@ class Tracker:
         """Waits for what is still being written and ends the run: FINISHED, FAILED or KILLED (to be continued)."""
         if self._client is None:
             return
-        with self._recording("the end of the run"):
+        with _recording("the end of the run"):
             for record in self._pending:  # (MLflow's own flush opens a default store in the working directory)
                 record.wait()
             self._client.set_terminated(self.run_id, status=status)
 
-    @contextmanager
-    def _recording(self, what: str) -> Iterator[None]:
-        """A store that fails in mid-run costs a warning, never the training."""
-        from mlflow.exceptions import MlflowException
 
-        try:
-            yield
-        except (MlflowException, OSError) as error:
-            reason = without_passwords(str(error).splitlines()[0])
-            print(f"warning: MLflow did not record {what}: {reason}", file=sys.stderr, flush=True)
+@contextmanager
+def _recording(what: str, *also: type[Exception]) -> Iterator[None]:
+    """A store that fails in mid-run (or with `also`) costs a warning, never the training."""
+    from mlflow.exceptions import MlflowException
+
+    tolerated: tuple[type[Exception], ...] = (MlflowException, OSError, *also)
+    try:
+        yield
+    except tolerated as error:
+        reason = without_passwords(str(error).splitlines()[0])
+        print(f"warning: MLflow did not record {what}: {reason}", file=sys.stderr, flush=True)
 
 
 DESCRIPTION = "mlflow.note.content"  # the tag that MLflow's page shows as a run's description, in markdown
@@ -329,14 +331,9 @@ def record_curves(run: Path, picture: Path) -> None:
     told, run_id = json.loads((run / "config.json").read_text()), (run / "mlflow_run_id").read_text().strip()
     if not run_id:
         return
-    from mlflow.exceptions import MlflowException
-
-    try:
+    with _recording(str(picture), UsageError):
         client = open_client(store_uri(told["tracking"]["uri"], str(run.parent)))
         add_artifacts(client, run_id, [picture], "training")
-    except (MlflowException, UsageError, OSError) as error:
-        reason = without_passwords(str(error).splitlines()[0])
-        print(f"warning: MLflow did not record {picture}: {reason}", file=sys.stderr, flush=True)
 
 
 def record_evaluation(run: Path, written: dict[str, Any], values: dict[str, float], folder: Path) -> bool:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from pipeline.common.cores import available_cores
 from pipeline.common.errors import DataError, UsageError
 from pipeline.common.files import write_atomically
 from pipeline.common.progress import Progress
@@ -134,7 +135,7 @@ def _claim(out: Path, config: MiniatureConfig, counts: tuple[int, int, int]) -> 
 
 def _run(out: Path, missing: list[PlacePhotos], config: MiniatureConfig) -> Iterator[int]:
     """Draws the places, and yields how many photos are done each time some are."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = available_cores()
     parts = [missing[k : k + 8] for k in range(0, len(missing), 8)]
     job, workers = partial(_draw_some, out, (config.width, config.height)), min(config.workers or cores, len(parts))
     if workers < 2:
