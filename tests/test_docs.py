@@ -45,7 +45,6 @@ ELSEWHERE = {
     "python -m jobs.evaluate --checkpoint CricaVPR.pth": "it needs the authors' file",
     "python -m jobs.locate --checkpoint outputs/cricavpr --index outputs/my_index --serve":
         "tests/jobs/test_job_locate.py",
-    "python -m jobs.experiment --table mined": "tests/jobs/test_job_experiment.py",
     "python -m pytest tests/gpu": "it needs a GPU",
     "docker": "it needs Docker; tests/jobs/test_container.py runs the entry point",
     "mlflow artifacts download": "tests/pipeline/training/records/test_records_tracking.py",
@@ -98,6 +97,7 @@ SLOW = (
     "python -m jobs.train --config jobs/configs/cricavpr.yaml --train.passes joint",
     "python -m jobs.evaluate --checkpoint outputs/cricavpr --groups single,bank",
     "python -m jobs.experiment --table one_photo",
+    "python -m jobs.experiment --table mined",
     "python -m jobs.experiment --table sota --released weights/released --root data",
     "OMP_NUM_THREADS=1 python -m jobs.experiment",
     "python -m jobs.experiment --table ablation_crica --config jobs/configs/paper.yaml --root data --seeds",
@@ -178,6 +178,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
         make_evaluation(world / "data" / "pitts30k", split=split)
     (world / "data" / "city" / "eval").mkdir()
     (world / "data" / "city" / "eval" / "miniature").symlink_to(world / "data" / "pitts30k")
+    for name in ("city_0", "city_7"):
+        (world / "data" / name).symlink_to(world / "data" / "pitts30k")
     for view, walk in enumerate(("day_left", "day_right", "night_right")):
         (world / "data" / "gardens_point" / walk).mkdir(parents=True)
         for place in range(8):
@@ -199,7 +201,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     os.chdir(world)
     try:
         run(["jobs.prepare", "--source", "data/gsv-cities", "--out", "data/shards", "--rounds", "2"], world)
-        for name in ("city_shards", "own_shards"):
+        for name in ("city_shards", "own_shards", "streets_shards"):
             (world / "data" / name).symlink_to(world / "data" / "shards")
         run(["jobs.train", "--config", "jobs/configs/cricavpr.yaml"], world)
         run(["jobs.train", "--config", "jobs/configs/cricavpr.yaml", "--name", "no-encoder"], world)
