@@ -94,7 +94,7 @@ def prepare(config: PrepareConfig, source: Path, out: Path) -> None:
             raise UsageError("--overwrite deletes what other parts have written; start it once, without --part")
         if not config.part or not config.parts:
             raise UsageError("--part and --parts go together, as --part 3 --parts 8")
-    check_writable(out)
+    check_writable(out, shared=bool(config.part))
     reading = SourceRule(config.kind, tuple(config.cities), config.cell_m, config.heading_deg)
     catalogue = read_source(source, reading)
     for remark in catalogue.remarks:

@@ -151,13 +151,15 @@ def _write_all(plan: groups.GroupPlan, out: Path, rule: WriteRule, part: int, pa
             progress.advance(written)
 
 
-def check_writable(out: Path) -> None:
+def check_writable(out: Path, shared: bool = False) -> None:
     """Whether the shards can be written to `out`, before any work is done; leaves nothing behind.
+
+    `shared`: other parts may be written there at the same time; then the folder stays, as it may be theirs already.
 
     Raises:
         UsageError: they cannot, such as on a read-only file system.
     """
-    made = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
+    made = [] if shared else [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     try:
         if not out.is_file():  # told later, with what else may be wrong with it
             files.check_writable(out, "--out")

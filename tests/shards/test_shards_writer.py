@@ -381,6 +381,13 @@ def test_where_nothing_can_be_written_it_is_said_before_any_work(tmp_path: Path)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+def test_a_part_does_not_take_the_folder_from_under_the_others(tmp_path: Path) -> None:
+    """Parts start together: one that removed the folder it had made would end another that was about to write there."""
+    out = tmp_path / "new" / "out"
+    check_writable(out, shared=True)
+    assert out.is_dir() and not list(out.iterdir())
+
+
 def test_16_bit_photos_and_bombs_of_ones_own_folder(tmp_path: Path, photo: Callable[[int], bytes]) -> None:
     """Deep grey is scaled, what would decode to gigabytes is named; neither is clipped or left out in silence."""
     import struct
